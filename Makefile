@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Each of the many processes that tests start would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: sweep test test-all lint smoke validate check benchmarks strangers fuzz mutants docs lock clean
+.PHONY: sweep test test-all lint smoke validate check artefacts ages benchmarks strangers fuzz mutants docs lock clean
 sweep: .venv/.ready
 	$(BIN)/python -m harness.sweep experiments/averaging.yaml
 
@@ -29,6 +29,14 @@ validate: .venv/.ready
 
 check: .venv/.ready
 	$(BIN)/python -m harness check experiments/regression.yaml
+
+# Stored answers that are older than the code, made again: `make artefacts ONLY=atlas`, `QUICK=1`, `make ages`.
+artefacts: .venv/.ready
+	$(BIN)/python -m harness artefacts $(addprefix --only ,$(ONLY)) $(if $(QUICK),--quick)
+
+# Says in the documents which of their tables and pictures are older than the code; seconds.
+ages: .venv/.ready
+	$(BIN)/python -m harness artefacts --ages
 
 benchmarks: .venv/.ready
 	$(BIN)/python tests/benchmarks/performance.py

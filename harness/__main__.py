@@ -21,6 +21,11 @@ class ProgramEntry(NamedTuple):
 
 PROGRAMS = (
     ProgramEntry(
+        "artefacts",
+        "harness.programs.artefacts.artefacts",
+        "makes stored answers again that are older than the code",
+    ),
+    ProgramEntry(
         "ask",
         "harness.programs.atlas.ask",
         "which camera finds a damage, at which distance, with how many frames, by stored limits",

@@ -11,6 +11,7 @@ from typing import Any
 
 from harness.evaluation.study.record import record_text
 from harness.evaluation.study.result import evaluate_study
+from harness.experiment.digests import experiment_digests
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
@@ -59,6 +60,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     began = time.monotonic()
     # recorded now: a commit during the sweep does not change the code that runs
     origin = record(command)
+    origin["digests"] = experiment_digests(experiment)
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder = experiment.folder(out)
     cache = out / ".cache" / "renders"

@@ -28,7 +28,7 @@ from harness.vocabulary.seeds import digest
 
 SIMULATION = ("scenes.sensor.source",)
 """With all that they import, these modules determine frames."""
-RECORDED_PROVENANCE = ("commit", "dirty", "versions", "seed", "command")
+RECORDED_PROVENANCE = ("commit", "dirty", "versions", "seed", "command", "digests")
 
 
 def record_of(

@@ -39,6 +39,17 @@ separate, because they are combined over repeats."""
 RECORDS_AT_ONCE = 100
 UNKNOWN = np.iinfo(np.int32).min  # marks an unknown value among whole numbers
 TENTH_UM = 1e-7  # metres
+IDENTIFIES_RUN = (
+    "results_version",
+    "experiment",
+    "digest",
+    "seed",
+    "commit",
+    "dirty",
+    "versions",
+    "digests",
+)
+"""Keys of a run's provenance that each of its Parquet files repeats, where there are such."""
 
 
 class _Probes(NamedTuple):
@@ -281,7 +292,6 @@ def write_tables(
     folder: Path, tables: Mapping[Table, pd.DataFrame], provenance: Mapping[str, Any]
 ) -> None:
     """Write tables; the schema of every Parquet file identifies the run."""
-    keys = ("results_version", "experiment", "digest", "seed", "commit", "dirty", "versions")
-    about = {key: provenance[key] for key in keys}
+    about = {key: provenance[key] for key in IDENTIFIES_RUN if key in provenance}
     for table, frame in tables.items():
         write_table(folder, table, frame, about)

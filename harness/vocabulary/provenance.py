@@ -13,7 +13,7 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,13 @@ def record(command: str) -> dict[str, Any]:
         "versions": versions(),
         "machine": machine,
     }
+
+
+def made_by(origin: Mapping[str, Any]) -> str:
+    """Return ``tofpod 0.2.0`` from the origin that a stored file states, which may lack it."""
+    versions_stated = origin.get("versions")
+    version = versions_stated.get("tofpod") if isinstance(versions_stated, Mapping) else None
+    return f"tofpod {version}" if isinstance(version, str) else "an unknown version of tofpod"
 
 
 # version of files that have none of their own; increased when the tables' meaning changes

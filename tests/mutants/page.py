@@ -14,6 +14,10 @@ Written by `make mutants`, not edited by hand. {number} small faults of the nume
 drawn with the seed {seed}, at most one of an expression. Each is put into a copy of the tree, where
 the tests of its room run without the slow ones. A fault is killed if a test fails or takes much too
 long.
+
+<!-- artefact: mutants -->
+
+<!-- end: mutants -->
 """
 
 

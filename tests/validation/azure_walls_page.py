@@ -306,6 +306,10 @@ This page compares the camera model with a public set of Azure Kinect wall frame
 a static camera, NFOV unbinned, 640 x 576,
 whole millimetres; everything except two plaster walls is masked out). {planes[0].upper()}{planes[1:]}.
 
+<!-- artefact: azure_walls -->
+
+<!-- end: azure_walls -->
+
 ![{_ALT}]({FIGURE})
 
 A plane is fitted robustly to each wall (1/z of a plane is a linear function of the rays' slopes x/z and y/z). The

@@ -90,6 +90,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""
+    from harness.programs.atlas.age import age_of
     from harness.programs.atlas.limits import surfaces_of
     from scenes.sensor.camera import load_camera
 
@@ -104,10 +105,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     surfaces = surfaces_of(limits)
     cameras = dict.fromkeys(surface.camera for surface in surfaces)
     titles = {camera: load_camera(camera).title for camera in cameras}
+    age = age_of(limits, about)
+    if age:
+        print(age)
     if has_question:
         _answer(options, surfaces, titles, about)
     if options.out is not None:
-        _write_atlas(options.out, surfaces, titles, about, command)
+        warnings = [age, *_warnings(titles)] if age else _warnings(titles)
+        _write_atlas(options.out, surfaces, titles, about, warnings=warnings, command=command)
     return 0
 
 
@@ -116,6 +121,8 @@ def _write_atlas(
     surfaces: Sequence[LimitSurface],
     titles: Mapping[str, str],
     about: Mapping[str, Any],
+    *,
+    warnings: Sequence[str],
     command: str,
 ) -> None:
     """Write the page, the picture and the table of the whole atlas."""
@@ -125,7 +132,7 @@ def _write_atlas(
 
     rows = curves(surfaces, titles)
     write_table(out, ATLAS, ATLAS.frame(rows), about)
-    page = atlas_html(rows, _warnings(titles), about, command)
+    page = atlas_html(rows, warnings, about, command)
     write_text(out / ATLAS_PAGE.name, page)
     save_atlas_png(out / ATLAS_PICTURE.name, rows)
     print(f"wrote {out / ATLAS_PAGE.name}, {ATLAS_PICTURE.name}, {', '.join(ATLAS.files)}")
@@ -164,8 +171,9 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
 def _refuse_odd(file: Path, limits: Any) -> None:
     """Raise UserError if a table lacks rows or columns, or holds other values than limits."""
     import numpy as np
-    from pandas.api.types import is_bool_dtype, is_numeric_dtype
+    from pandas.api.types import is_bool_dtype, is_integer_dtype, is_numeric_dtype
 
+    from harness.programs.atlas.age import VERSION
     from harness.programs.atlas.limits import AXES, CAMERA, DAMAGE, DETECTOR, damage_of
 
     if limits.columns.duplicated().any():
@@ -192,6 +200,8 @@ def _refuse_odd(file: Path, limits: Any) -> None:
     for name in NEEDED_AXES:
         if limits[name].isna().any():
             raise UserError(f"{file}: {name} lacks a number", legal=LEGAL)
+    if VERSION in limits and not is_integer_dtype(limits[VERSION]):
+        raise UserError(f"{file}: {VERSION} holds a value that is no whole number", legal=LEGAL)
     if not is_bool_dtype(limits[IS_AT_MOST]):
         raise UserError(
             f"{file}: {IS_AT_MOST} holds a value that is not true or false", legal=LEGAL

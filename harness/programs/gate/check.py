@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
+    from harness.experiment.schema import Experiment
 
 BASELINES = shipped(
     "baselines"
@@ -111,6 +113,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     baseline = _baseline(
         path, update=options.update
     )  # before anything runs, because a study takes minutes
+    if baseline is not None:
+        _state_age(baseline, experiment, path)
     code = run_study(experiment, options.out, engine, command)
     if code not in (0, 1):
         return code
@@ -145,6 +149,21 @@ def main(options: argparse.Namespace, command: str) -> int:
         fix = "run the check again with --update and commit the baseline"
         raise UserError(f"{path}: cannot serve as a baseline: {message}", fix=fix)
     return 0
+
+
+def _state_age(baseline: StudyRecord, experiment: Experiment, path: Path) -> None:
+    """Print what has changed since the baseline was written, if anything has."""
+    from harness.experiment.digests import experiment_digests
+    from harness.vocabulary.code_digests import changed_parts
+    from harness.vocabulary.provenance import made_by
+
+    stored = baseline.provenance.get("digests")
+    changed = "it does not state its code"
+    if isinstance(stored, Mapping):
+        parts = changed_parts(stored, experiment_digests(experiment))
+        changed = f"since then changed: {', '.join(parts)}" if parts else ""
+    if changed:
+        print(f"{path} is older than the code ({made_by(baseline.provenance)}): {changed}")
 
 
 def _baseline(path: Path, *, update: bool) -> StudyRecord | None:

@@ -12,6 +12,8 @@ from harness.vocabulary.files import size_text
 from harness.vocabulary.program import program
 
 DAY_S = 86_400.0
+FIRST_PARTS = 3
+"""Parts of the code that the list of artefacts names; JSON has all."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +21,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "what",
         nargs="?",
-        help="detectors, cameras, results, cache, keys (of experiments); or a detector or camera",
+        help="detectors, cameras, results, cache, artefacts, keys (of experiments); "
+        "or a detector or camera",
     )
     add(
         "name",
@@ -41,11 +44,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "List detectors and cameras: tofpod's own and those that installed packages offer "
     "through the entry point "
     "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of "
-    "renders, or all keys of an "
-    "experiment.",
+    "renders, the age of stored answers (artefacts), or all keys of an experiment.",
     epilog="examples: tofpod ls; tofpod ls thesis; tofpod ls cameras kinect_v2; "
     "tofpod ls --json; tofpod ls results; tofpod ls results averaging; "
-    "tofpod ls cache",
+    "tofpod ls cache; tofpod ls artefacts",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if something listed is broken), 2 for a user's mistake."""
@@ -54,7 +56,8 @@ def main(options: argparse.Namespace, command: str) -> int:
 
         print(reference())
         return 0
-    return {"results": _list_results, "cache": _list_cache}.get(options.what, _list_offers)(options)
+    listings = {"results": _list_results, "cache": _list_cache, "artefacts": _list_artefacts}
+    return listings.get(options.what, _list_offers)(options)
 
 
 def _list_offers(options: argparse.Namespace) -> int:
@@ -85,7 +88,7 @@ def _list_offers(options: argparse.Namespace) -> int:
             if name is not None
             else [name for kind in SETTABLE for name in plug_ins(kind).names()]
         )
-        legal = [*SETTABLE, "results", "cache", "keys", *names]
+        legal = [*SETTABLE, "results", "cache", "artefacts", "keys", *names]
         nearest_word = nearest(word, legal)
         meant = f"; did you mean {nearest_word!r}?" if nearest_word else ""
         fix = "run tofpod ls for a list"
@@ -164,6 +167,28 @@ def _list_cache(options: argparse.Namespace) -> int:
         print(f"  longest time without use: {unused_days:.1f} days")
     if leftover_files:
         print(f"  left by killed processes: {len(leftover_files)} files")
+    return 0
+
+
+def _list_artefacts(options: argparse.Namespace) -> int:
+    """List every stored answer with its age and with what has changed since it was made."""
+    from harness.programs.artefacts.listing import ages
+    from harness.vocabulary.text import Grid, show
+
+    rows = ages()
+    if options.json:
+        return _print_json(rows)
+    heads = ("artefact", "made", "by tofpod", "seconds", "older than")
+    cells = []
+    for row in rows:
+        older_than = row["older_than"]
+        more = len(older_than) - FIRST_PARTS
+        shown = ", ".join(older_than[:FIRST_PARTS]) + (f" and {more} more" if more > 0 else "")
+        facts = (row["made"], row["tofpod"], row["seconds"])
+        cells.append(
+            (row["name"], *("–" if fact is None else fact for fact in facts), shown or "–")
+        )
+    show([Grid.of(heads, cells, left=3)])
     return 0
 
 

@@ -33,7 +33,8 @@ TABLES = """
 # Tables
 
 Parquet files hold all digits. Their schema holds each column's unit and description, and the
-origin (key `tofpod`: commit, versions, seed). CSV files hold six digits. The ending of a column's
+origin (key `tofpod`: commit, versions, seed, and the digests of the code, cameras and settings that
+the numbers hang on). CSV files hold six digits. The ending of a column's
 name is its unit. An empty cell means that the value is unknown or not demonstrated. `x_low` and
 `x_high` are the ends of the 95 % interval of `x`. Tables without rows are not written. An
 experiment with axes has another column for each axis, named by its dotted path."""

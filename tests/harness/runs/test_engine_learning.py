@@ -18,7 +18,7 @@ from harness.programs.cluster import merge
 from harness.runs.journal import Journal
 from harness.runs.plan import Group, SweepPlan, plan_of
 from harness.runs.shards import Shard
-from harness.runs.study_record import record_of
+from harness.runs.study_record import RECORDED_PROVENANCE, record_of
 from harness.runs.tables import tables_of
 from harness.tables.limits import limits_grid, quoted, study_answer
 from harness.tables.study import set_by, threshold_warnings
@@ -56,7 +56,7 @@ def study_of(study_out: Path, folder: Path, *changes: str, shards: int = 1) -> S
     assert outcome.failures == []
     assert (outcome.trials.done == 0) == (shards > 1), "shards leave nothing to do"
     tables = tables_of(records_of(folder / "journal", outcome), experiment)
-    provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
+    provenance = dict.fromkeys(RECORDED_PROVENANCE)
     return record_of(experiment, plan, tables, {}, provenance)
 
 

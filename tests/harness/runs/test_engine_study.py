@@ -12,18 +12,25 @@ from typing import cast
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from scipy import stats
 
 from harness.evaluation.study.record import StudyRecord, read_record
 from harness.evaluation.study.result import evaluate_study
+from harness.experiment.digests import experiment_digests
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import Point
 from harness.records.trials import ResultTables
 from harness.runs import run
 from harness.runs.calibration import threshold_of
 from harness.runs.plan import plan_of
-from harness.runs.study_record import failures_by_point, record_of, without_limit
+from harness.runs.study_record import (
+    RECORDED_PROVENANCE,
+    failures_by_point,
+    record_of,
+    without_limit,
+)
 from harness.runs.tables import tables_of
 from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.declaration.yaml_source import DeclarationError
@@ -200,7 +207,7 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
     plan = plan_of(experiment, finished / ".cache" / "renders")
     outcome = run_serially(plan, tmp_path)
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
-    provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
+    provenance = dict.fromkeys(RECORDED_PROVENANCE)
     record = record_of(
         experiment, plan, tables_of(records_of(tmp_path, outcome), experiment), failed, provenance
     )
@@ -258,6 +265,17 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     assert runs[runs.role != "calibration"].groupby("frames").threshold.nunique().eq(1).all()
 
 
+def test_a_study_states_what_its_numbers_hang_on(finished):
+    """In its provenance, in its record, which a gate keeps, and in its tables, which `ask` reads."""
+    folder = results(finished)
+    digests = json.loads((folder / "provenance.json").read_text())["digests"]
+    assert digests == experiment_digests(load_experiment(folder / "experiment.yaml"))
+    assert {"camera azure_kinect_nfov", "detectors/methods", "scenes/render"} <= set(digests)
+    assert read_record(folder).provenance["digests"] == digests
+    stored = pq.read_schema(folder / "limits.parquet").metadata[b"tofpod"]
+    assert json.loads(stored)["digests"] == digests
+
+
 def judged(
     home: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *changes: str
 ) -> tuple[StudyRecord, ResultTables]:
@@ -268,7 +286,7 @@ def judged(
     outcome = run_serially(plan, folder)
     assert outcome.failures == []
     tables = tables_of(records_of(folder, outcome), experiment)
-    provenance = dict.fromkeys(("commit", "dirty", "versions", "seed", "command"))
+    provenance = dict.fromkeys(RECORDED_PROVENANCE)
     return record_of(experiment, plan, tables, {}, provenance), tables
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from detectors import detector_type
+from harness import __version__
+from harness.experiment.digests import simulation_digests
 from harness.programs.atlas.ask import main
 from harness.programs.atlas.limits import Outside, surfaces_of
 from tests.harness.report.test_view3d import browsed
@@ -132,10 +136,59 @@ def test_a_limit_below_all_sizes_is_no_limit_above_them():
     )
 
 
+def about_today() -> dict[str, Any]:
+    """What a study of today stores beside its limits."""
+    digests = simulation_digests(["matched"], ["azure_kinect_nfov"])
+    return {
+        "digests": {**digests, "experiment atlas": "any"},
+        "versions": {"tofpod": __version__},
+    }
+
+
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
-    limits().to_parquet(tmp_path / "limits.parquet")
+    written_atlas(tmp_path / "limits.parquet", limits(), json.dumps(about_today()).encode())
     return tmp_path
+
+
+def first_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(arguments) == 0
+    return capsys.readouterr().out.splitlines()[0]
+
+
+def test_an_atlas_of_todays_code_is_not_called_older(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    about = json.dumps(about_today()).encode()
+    asked = written_atlas(tmp_path / "atlas.parquet", limits(), about)
+    assert first_line(asked, capsys).startswith("Through-holes of 5 mm")
+
+
+@pytest.mark.parametrize("part", ["detectors/methods", "scenes/render", "camera azure_kinect_nfov"])
+def test_the_first_line_says_that_the_atlas_is_older_than_a_part_of_the_code(
+    part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    about = about_today()
+    about["digests"][part] = "0123456789ab"
+    table = limits().assign(detector_version=7)
+    asked = written_atlas(tmp_path / "atlas.parquet", table, json.dumps(about).encode())
+    now = detector_type("matched").version
+    assert first_line(asked, capsys) == (
+        f"Older than the code: this atlas was computed by tofpod {__version__} with version 7 of"
+        f" matched (now {now}); today's limits may differ."
+    )
+    assert main([*asked, "--out", str(tmp_path / "out")]) == 0
+    assert "Older than the code" in (tmp_path / "out" / "atlas.html").read_text()
+
+
+def test_an_atlas_that_states_no_code_is_called_older(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    asked = written_atlas(tmp_path / "atlas.parquet", limits())
+    assert first_line(asked, capsys).startswith(
+        "Older than the code: this atlas was computed by an unknown version of tofpod with"
+        " an unknown version of matched (now "
+    )
 
 
 def test_answer_page_and_data_say_the_same(stored: Path, capsys: pytest.CaptureFixture[str]):
@@ -223,7 +276,8 @@ def test_both_ends_of_the_albedo_are_answered_unless_one_is_asked_for(
     bright = limits().assign(**{"source.target.material.albedo_850": 0.6})
     sizes = ["a90_mm", "a90_low_mm", "a90_high_mm"]
     dark[sizes] *= 2.0
-    pd.concat([dark, bright]).to_parquet(tmp_path / "limits.parquet")
+    about = json.dumps(about_today()).encode()
+    written_atlas(tmp_path / "limits.parquet", pd.concat([dark, bright]), about)
     question = ["--size", "7mm", "--distance", "1m", "--atlas", str(tmp_path)]
     assert main([*question, "--out", str(tmp_path / "out")]) == 0
     output = capsys.readouterr().out
@@ -324,6 +378,7 @@ DAMAGE = "source.target.damage"
         ("a90_mm", "x", "a90_mm holds a value that is no number"),
         ("a90_mm", 0.0, "a90_mm holds a size that is not above 0"),
         ("hits", True, "hits holds a value that is no number"),
+        ("detector_version", 7.5, "detector_version holds a value that is no whole number"),
         ("source.target.distance_m", -1.0, "distance_m holds a number that is not above 0"),
         ("source.target.distance_m", np.nan, "distance_m lacks a number"),
         ("frames", 0, "frames holds a number that is not above 0"),

@@ -15,6 +15,7 @@ import pytest
 
 from harness.evaluation.study.record import StudyRecord, read_record, record_text
 from harness.experiment import load
+from harness.experiment.digests import experiment_digests
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import Experiment
 from harness.programs.gate import check
@@ -119,6 +120,22 @@ def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(
         and len(read_record(program.baseline).set_ups) == 1
     )
     assert program(record()) == 0
+
+
+def test_the_first_line_says_that_the_baseline_is_older_and_since_what(program, experiment, capsys):
+    found = record()
+    now = experiment_digests(experiment)
+
+    def first_line(digests: object) -> str:
+        provenance = {**found.provenance, "versions": {"tofpod": "0.1.0"}, "digests": digests}
+        write_text(program.baseline, record_text(replace(found, provenance=provenance)))
+        assert program(found) == 0
+        return capsys.readouterr().out.partition("\n")[0]
+
+    older = f"{program.baseline} is older than the code (tofpod 0.1.0): "
+    assert first_line({**now, "scenes/render": "0"}) == f"{older}since then changed: scenes/render"
+    assert first_line(None) == f"{older}it does not state its code"
+    assert "older" not in first_line(now)
 
 
 def test_a_folder_is_no_baseline(program, capsys):

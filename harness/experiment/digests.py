@@ -1,0 +1,79 @@
+"""Digests of what an experiment's results hang on: code, cameras and its own settings."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from detectors import DETECTORS
+from harness.experiment.schema import Experiment, SimulatedSource
+from harness.vocabulary.code_digests import DIGITS, Digests, code_digests
+from harness.vocabulary.seeds import digest
+from scenes.sensor.camera import load_camera
+
+ROOTS = ("harness.trials.learning", "harness.evaluation.study.result", "harness.runs.calibration")
+"""Modules that, with all that they import, decide a study's numbers; detectors come beside them."""
+KINDS = ("scenes/sensor/amcw", "scenes/sensor/empirical", "scenes/sensor/lidar")
+"""Rooms of one kind of camera each, which no other kind imports."""
+ONLY_OF_CAPTURES = ("detectors/recordings",)
+ONLY_OF_SEVERAL_VIEWS = ("detectors/views",)
+EXPERIMENT = "experiment "
+"""Begins the name of the part that stands for an experiment's own settings."""
+NO_NUMBERS = ("name", "title")
+"""Keys of an experiment on which no number hangs."""
+
+
+def experiment_digests(experiment: Experiment) -> Digests:
+    """Return the digests of all that a simulated experiment's results hang on."""
+    sources = [point.config.source for point in experiment.points]
+    simulated = [source for source in sources if isinstance(source, SimulatedSource)]
+    digests = simulation_digests(
+        detectors={point.config.detector.name for point in experiment.points},
+        cameras={source.camera.name for source in simulated},
+        several_views=any(source.views is not None for source in simulated),
+    )
+    settings = {key: value for key, value in experiment.data.items() if key not in NO_NUMBERS}
+    digests[f"{EXPERIMENT}{experiment.config.name}"] = digest(_stated(settings))[:DIGITS]
+    return digests
+
+
+def simulation_digests(
+    detectors: Iterable[str], cameras: Iterable[str], *, several_views: bool = False
+) -> Digests:
+    """Return the digests of the code that simulates and judges with these detectors and cameras,
+    and of the cameras' numbers. Rooms of which such a run uses nothing are left out."""
+    modules = [DETECTORS.offer(name).target.partition(":")[0] for name in detectors]
+    names = set(cameras)
+    kinds = {type(load_camera(name)).__module__.rpartition(".")[0] for name in names}
+    unused = [room for room in KINDS if room.replace("/", ".") not in kinds]
+    unused += ONLY_OF_CAPTURES
+    unused += () if several_views else ONLY_OF_SEVERAL_VIEWS
+    digests = {
+        room: value
+        for room, value in code_digests([*ROOTS, *modules]).items()
+        if not room.startswith(tuple(unused))
+    }
+    return digests | camera_digests(names)
+
+
+def camera_digests(names: Iterable[str]) -> Digests:
+    """Return the digest of each camera's numbers, without their tags and sources."""
+    data = {name: _values(load_camera(name).to_data()) for name in sorted(names)}
+    return {f"camera {name}": digest(numbers)[:DIGITS] for name, numbers in data.items()}
+
+
+def _values(data: Any) -> Any:
+    """Return a camera's data with the value of each fact in place of value, tag, source and
+    range."""
+    if isinstance(data, Mapping):
+        if "value" in data and "source" in data:
+            return data["value"]
+        return {key: _values(value) for key, value in data.items() if key not in NO_NUMBERS}
+    return [_values(item) for item in data] if isinstance(data, list) else data
+
+
+def _stated(data: Any) -> Any:
+    """Return a declaration without keys that are empty, so that a new key, of which nothing is
+    stated, changes no digest."""
+    if not isinstance(data, Mapping):
+        return data
+    stated = {key: _stated(value) for key, value in data.items()}
+    return {key: value for key, value in stated.items() if value not in (None, {}, [], ())}

@@ -1,0 +1,123 @@
+"""The ledger of artefacts: when each was made, by which code, and how old it is."""
+
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import Field
+
+from harness import __version__
+from harness.programs.artefacts.declaration import (
+    artefact_named,
+    declared_artefacts,
+    digests_today,
+    files_of,
+)
+from harness.vocabulary.code_digests import changed_parts, file_digests
+from harness.vocabulary.config import Config
+from harness.vocabulary.files import shipped, strict_json, write_json
+
+LEDGER = "artefacts.json"
+
+
+class Made(Config):
+    """An entry of the ledger."""
+
+    made: str
+    """Date."""
+    tofpod: str | None = None
+    """Version that made it; None if it is not known."""
+    seconds: float | None = None
+    """Seconds of the run that made it; None if nothing measured them."""
+    quick: bool = False
+    """It comes from a quick run, with fewer boards."""
+    digests: dict[str, str] | None = None
+    """Digests of all that it hangs on; None if it was made before there were digests."""
+    files: dict[str, str] = Field(default_factory=dict)
+    """Digests of its files."""
+
+
+Ledger = Mapping[str, Made]
+
+
+def ledger_path() -> Path:
+    """Return the file that holds the ledger."""
+    return shipped("baselines") / LEDGER
+
+
+def read_ledger() -> dict[str, Made]:
+    """Return how each artefact was made, by name."""
+    path = ledger_path()
+    data = strict_json(path.read_bytes()) if path.is_file() else {}
+    return {name: Made.from_data(made) for name, made in data.items()}
+
+
+def store_entry(name: str, made: Made) -> None:
+    """Store how an artefact was made, beside the entries that other processes may have stored."""
+    ledger = read_ledger() | {name: made}
+    known = [name for name in declared_artefacts() if name in ledger]
+    write_json(ledger_path(), {name: ledger[name].to_data() for name in known})
+
+
+def made_now(name: str, seconds: float | None, *, quick: bool = False) -> Made:
+    """Return the entry of an artefact that has just been made."""
+    return Made(
+        made=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        tofpod=__version__,
+        seconds=seconds,
+        quick=quick,
+        digests=digests_today(name),
+        files=file_digests(files_of(name)),
+    )
+
+
+def changed_since(name: str, ledger: Ledger) -> list[str]:
+    """Return the parts that an artefact hangs on and that have changed since it was made; none of
+    what is printed whenever documents are written."""
+    if artefact_named(name).prints:
+        return []
+    made = ledger.get(name)
+    if made is None:
+        return ["it was never made"]
+    if made.digests is None:
+        return ["it does not state its code"]
+    return changed_parts(made.digests, digests_today(name))
+
+
+def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
+    """Return what has changed since an artefact was made, and the older artefacts that it is made
+    of; nothing if it is not older."""
+    older_sources = [
+        f"artefact {source}"
+        for source in artefact_named(name).of
+        if reasons_it_is_older(source, ledger)
+    ]
+    return changed_since(name, ledger) + older_sources
+
+
+def is_quick(name: str, ledger: Ledger) -> bool:
+    """Return whether an artefact, or one that it is made of, comes from a quick run."""
+    made = ledger.get(name)
+    sources = artefact_named(name).of
+    return bool(made and made.quick) or any(is_quick(source, ledger) for source in sources)
+
+
+def edited_files(name: str, ledger: Ledger) -> list[str]:
+    """Return the files of an artefact that are not as they were made."""
+    made = ledger.get(name)
+    stored = {} if made is None else made.files
+    return changed_parts(stored, file_digests(files_of(name)))
+
+
+def age_sentence(name: str, ledger: Ledger) -> str:
+    """Return what a document says beside an artefact that is older than the code or comes from a
+    quick run; an empty text beside any other."""
+    made = ledger.get(name)
+    if made is None:
+        return "*Not yet computed.*"
+    if reasons_it_is_older(name, ledger):
+        by = f" by tofpod {made.tofpod}" if made.tofpod else ""
+        return f"*Older than the code: computed on {made.made}{by}.*"
+    if is_quick(name, ledger):
+        return "*From a quick run: fewer boards or repeats, so wider intervals.*"
+    return ""

@@ -1,0 +1,110 @@
+"""Makes artefacts again: runs their commands, stores their files, and keeps the ledger."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+
+from harness.programs.artefacts.declaration import artefact_named, data_file
+from harness.programs.artefacts.ledger import (
+    Ledger,
+    changed_since,
+    edited_files,
+    made_now,
+    read_ledger,
+    store_entry,
+)
+from harness.programs.artefacts.quoted import stored_rows
+from harness.vocabulary import provenance
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_bytes, write_text
+
+SWEEP = ["tofpod", "sweep"]
+
+
+def make_all(names: Iterable[str], *, quick: bool) -> list[str]:
+    """Make those of the named artefacts that are due, and print the seconds of each. Each is
+    stored in the ledger at once, so that a run that is killed goes on where it was. Returns the
+    names of those that fail."""
+    ledger = read_ledger()
+    named = list(names)
+    due = due_of(named, ledger, quick=quick)
+    expected_s = {name: _expected_s(name, ledger) for name in due}
+    print(f"{len(due)} of {len(named)} artefacts are to be made, in about", end=" ")
+    print(f"{sum(expected_s.values()) / 60:.0f} min on two idle cores", flush=True)
+    failed = []
+    for name in due:
+        print(f"{name}: {artefact_named(name).about}; about {expected_s[name]:.0f} s", flush=True)
+        began = time.monotonic()
+        try:
+            _make(name, quick=quick)
+        except UserError as mistake:
+            print(f"{name}: not made: {mistake}", file=sys.stderr)
+            failed.append(name)
+            continue
+        seconds = round(time.monotonic() - began, 1)
+        store_entry(name, made_now(name, seconds, quick=quick and _has_quick_form(name)))
+        print(f"{name}: made in {seconds:.0f} s", flush=True)
+    return failed
+
+
+def due_of(names: Iterable[str], ledger: Ledger, *, quick: bool) -> list[str]:
+    """Return those of the named artefacts that are to be made: what they hang on has changed, or
+    what they are made of is made before them, or a file was edited, or they come from a quick run
+    and this one is not."""
+    due: list[str] = []
+    for name in names:
+        artefact = artefact_named(name)
+        if artefact.by_hand or artefact.prints:
+            continue
+        is_older = bool(changed_since(name, ledger)) or any(source in due for source in artefact.of)
+        if is_older or edited_files(name, ledger) or (ledger[name].quick and not quick):
+            due.append(name)
+    return due
+
+
+def _expected_s(name: str, ledger: Ledger) -> float:
+    """Return the seconds that the last whole run took, or else the declared ones."""
+    made = ledger.get(name)
+    if made is None or made.seconds is None or made.quick:
+        return artefact_named(name).seconds
+    return made.seconds
+
+
+def _make(name: str, *, quick: bool) -> None:
+    """Run an artefact's commands and store its files. Raises UserError if something that it needs
+    is absent, or if a command fails."""
+    artefact = artefact_named(name)
+    for needed in artefact.needs:
+        if shutil.which(needed) is None and not (provenance.ROOT / needed).exists():
+            raise UserError(f"needs {needed}, which is not here")
+    for command in artefact.commands:
+        _run(command, quick=quick)
+    for file, source in artefact.stores.items():
+        write_bytes(provenance.ROOT / file, (provenance.ROOT / source).read_bytes())
+    if artefact.table is not None:
+        write_text(provenance.ROOT / data_file(name), stored_rows(artefact.table, artefact.rows))
+
+
+def _has_quick_form(name: str) -> bool:
+    """Return whether `--quick` changes one of an artefact's commands: sweeps have that option."""
+    return any(shlex.split(command)[:2] == SWEEP for command in artefact_named(name).commands)
+
+
+def _run(command: str, *, quick: bool) -> None:
+    """Run a command in the repository; its output goes to this terminal. Raises UserError if it
+    ends with an error."""
+    program, *words = shlex.split(command)
+    called = [program, *words]
+    if program == "tofpod":
+        called = [sys.executable, "-m", "harness", *words]
+        called += ["--quick"] if quick and [program, words[0]] == SWEEP else []
+    if program == "python":
+        called = [sys.executable, *words]
+    code = subprocess.run(called, cwd=provenance.ROOT, check=False).returncode
+    if code == 130:
+        raise KeyboardInterrupt
+    if code:
+        raise UserError(f"{command}: ended with exit code {code}")

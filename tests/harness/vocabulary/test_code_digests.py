@@ -1,0 +1,121 @@
+"""A digest of code changes with what decides a number, and with nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness.vocabulary import code_digests as digests_module
+from harness.vocabulary import provenance
+from harness.vocabulary.code_digests import changed_parts, code_digests, file_digests
+
+FILES = {
+    "harness/__init__.py": "",
+    "harness/trials/__init__.py": "",
+    "harness/trials/trial.py": (
+        '"""A trial."""\n'
+        "from detectors.methods import thesis\n"
+        "from harness.report import page\n"
+        "K = 5  # a reason\n\n\n"
+        'def judge(x):\n    """Judge."""\n    return (x + K) > 0\n'
+    ),
+    "harness/report/__init__.py": "",
+    "harness/report/page.py": "WIDTH = 3\n",
+    "detectors/__init__.py": "",
+    "detectors/methods/__init__.py": "",
+    "detectors/methods/thesis.py": "K = 2.6\n",
+    "detectors/methods/local.py": "K = 7\n",
+}
+TRIAL = "harness/trials/trial.py"
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    yield tmp_path
+    forget()
+
+
+def forget() -> None:
+    for cached in (provenance.reached_sources, provenance._content, digests_module._of_source):
+        cached.cache_clear()
+
+
+def fresh() -> dict[str, str]:
+    forget()
+    return code_digests(["harness.trials.trial"])
+
+
+def changed(project: Path, name: str, old: str, new: str) -> list[str]:
+    """The parts that a replacement in a file changes."""
+    before = fresh()
+    path = project / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    after = fresh()
+    path.write_text(text)
+    return changed_parts(before, after)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("# a reason", "# another reason"),
+        ('"""Judge."""', '"""Return whether x lies above -K."""'),
+        ('"""A trial."""\n', '"""One trial\nof many."""\n'),
+        ("\n\n\ndef", "\n\ndef"),
+        ("return (x + K) > 0", "return x + K > 0"),
+        ("judge(x):", "judge(\n    x,\n):"),
+    ],
+)
+def test_comments_docstrings_and_layout_age_nothing(project: Path, old: str, new: str):
+    assert changed(project, TRIAL, old, new) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "room"),
+    [
+        (TRIAL, "K = 5", "K = 6", "harness/trials"),
+        (TRIAL, "x + K", "x - K", "harness/trials"),
+        (TRIAL, "> 0", ">= 0", "harness/trials"),
+        ("detectors/methods/thesis.py", "2.6", "2.5", "detectors/methods"),
+    ],
+)
+def test_every_number_and_sign_ages_its_room(
+    project: Path, name: str, old: str, new: str, room: str
+):
+    assert changed(project, name, old, new) == [room]
+
+
+def test_pages_and_what_is_not_reached_age_nothing(project: Path):
+    assert changed(project, "harness/report/page.py", "3", "4") == []
+    assert changed(project, "detectors/methods/local.py", "7", "8") == []
+    assert set(fresh()) == {"harness/trials", "detectors", "detectors/methods"}
+
+
+def test_files_count_by_their_content(project: Path):
+    (project / "a.yaml").write_text("x: 1 # a comment\n")
+    (project / "b.bin").write_bytes(b"\x00")
+    first = file_digests(["a.yaml", "b.bin", "detectors", "gone"])
+    assert first["gone"] == "absent"
+
+    forget()
+    (project / "a.yaml").write_text("x:   1\n")
+    assert file_digests(["a.yaml", "b.bin", "detectors", "gone"]) == first
+
+    forget()
+    (project / "a.yaml").write_text("x: 2\n")
+    (project / "b.bin").write_bytes(b"\x01")
+    (project / "detectors/methods/local.py").write_text("K = 9\n")
+    second = file_digests(["a.yaml", "b.bin", "detectors", "gone"])
+    assert changed_parts(first, second) == ["a.yaml", "b.bin", "detectors"]
+
+
+def test_a_part_that_is_new_or_gone_is_a_change():
+    assert changed_parts({"a": "1", "b": "2"}, {"b": "2", "c": "3"}) == ["a", "c"]
