@@ -189,15 +189,19 @@ def _with_faces(
         largest = surfaces[int(np.argmax(shared))]
         if np.count_nonzero(area) <= FACES_FROM * max(shared):
             continue
-        part = extruded_faces(area, largest, points_m, apart_m, crease_deg, central)
-        if part is None:
+        if not _is_wide(area & ~largest, reach):
             continue
-        # the picture's edge cuts a strip no wider
-        added = np.pad(part & ~largest, 1)
-        if shrunk(added, 2 * reach + 1)[1:-1, 1:-1].any():
+        part = extruded_faces(area, largest, points_m, apart_m, crease_deg, central)
+        if part is not None and _is_wide(part & ~largest, reach):
             part = part | largest
             surfaces = [part, *[surface for surface in surfaces if not _lies_in(surface, part)]]
     return np.array(surfaces).reshape(-1, *unbroken.shape)
+
+
+def _is_wide(faces: np.ndarray, reach: int) -> bool:
+    """Return whether a place in the mask (h, w) is farther than ``reach`` pixels from its rim, to
+    which the picture's edge belongs."""
+    return bool(shrunk(np.pad(faces, 1), 2 * reach + 1)[1:-1, 1:-1].any())
 
 
 def _areas_of(masks: np.ndarray, unbroken: np.ndarray) -> list[int]:

@@ -210,7 +210,8 @@ def test_a_study_over_units_states_the_limit_of_a_new_unit_beside_that_of_one(ov
     limit = limit_of(set_up, draws=50)
     assert set_up.units == 3 and limit.inspections == 3 * limit.targets
     assert limit.over_units is not None and limit.over_units.a90_mm.shape == (3,)
-    assert quoted(limit).value > limit.a90_95.value > limit.a90_mm
+    # equal where the three units find the same holes
+    assert quoted(limit).value >= limit.a90_95.value > limit.a90_mm
     assert {"new unit (mm)", "one unit (mm)", "beside/m²"} <= set(limits_grid([limit]).heads)
     assert not study_answer([limit]).startswith("One unit")
     assert set_up.beside is not None and set_up.beside.area_m2.sum() == pytest.approx(
