@@ -5,9 +5,9 @@ public source, or derived from such), and that the simulation of a plane or an e
 moved to the ends of its `range`, or by 30 % where none is stated; where no figure of the camera
 notices, also in the cameras that inherit it (`like`). A figure notices if its value leaves or
 enters a band: that of the source's own tolerance, that of 25 %, or that in which the figure passes;
-a family, if its verdict changes. The change must exceed 2 % and the reading's 95 % interval. Camera
-and moved camera are measured with the same noise, in fewer frames than the scorecard's, so verdicts
-near a limit may differ from it.
+a family, if its verdict changes. The change must exceed 5 %. Camera and moved camera are measured
+with the same noise, in fewer frames than the scorecard's, so verdicts near a limit may differ from
+it.
 
 Not moved: the lens, the places and cones of lights, choices of a rule, and numbers that are 0 and
 state no range."""
@@ -43,7 +43,7 @@ from scenes.sensor.camera import camera_of, load_camera, stated_in
 from scenes.sensor.common.config import CameraConfig
 
 SHARE = 0.3  # of a constant without a range
-LEAST_CHANGE = 0.02  # share by which a value must change, lest noise near a limit counts
+LEAST_CHANGE = 0.05  # share by which a value must change, lest noise near a limit counts
 EVIDENT = ("R", "D")  # tags of numbers that are not moved
 NOT_MOVED = (
     "lens.",
@@ -227,10 +227,8 @@ def _differ(old: Score, new: Score) -> bool:
     old_value, new_value = old.simulated.value, new.simulated.value
     if np.isnan(old_value) or np.isnan(new_value):
         return bool(np.isnan(old_value) != np.isnan(new_value))
-    interval = old.simulated.interval
-    noise = (interval.high - interval.low) / 2 if interval.known else 0.0
-    least = max(noise, LEAST_CHANGE * abs(old_value))
-    return old.grade != new.grade and abs(new_value - old_value) > least
+    change = abs(new_value - old_value)
+    return old.grade != new.grade and change > LEAST_CHANGE * abs(old_value)
 
 
 def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved]:

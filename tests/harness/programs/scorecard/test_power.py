@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from harness.evaluation.intervals import Interval
 from harness.programs.scorecard import power
 from harness.programs.scorecard.bench import BRIEF, Bench
 from harness.programs.scorecard.figures import Request, read_figures
@@ -122,20 +121,20 @@ def moved_with(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     values: dict[str, float],
-    known: Interval | None = None,
+    unmoved: float = 1.0,
 ) -> dict[str, Moved]:
-    """Return the moves of the cameras where a reading is 1 or, if a constant of ``values`` is
-    replaced by a greater value than its own, that of ``values``."""
+    """Return the moves of the cameras where a reading is ``unmoved`` or, where a constant of
+    ``values`` is replaced, that of ``values``."""
     taken: list[Request] = []
 
     def measured(requests: Any, effort: Any, jobs: int) -> dict[Request, Reading]:
         readings = {}
         for request in requests:
             taken.append(request)
-            value = 1.0
+            value = unmoved
             for key, _ in request.numbers:
-                value = values.get(key, 1.0)
-            readings[request] = Reading(value, known) if known else Reading(value)
+                value = values.get(key, unmoved)
+            readings[request] = Reading(value)
         return readings
 
     monkeypatch.setattr(power, "measured", measured)
@@ -214,10 +213,12 @@ def test_the_effects_of_a_quantity_are_those_it_is_measured_with(
         assert on <= declared, name
 
 
-def test_noise_is_not_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A change from 1 to 1.12 within the reading's interval of 0.15 either way."""
-    values = {"photons.read_noise_electrons": 1.12, "photons.band_nm": 1.3}
-    rows = moved_with(tmp_path, monkeypatch, values, Interval(0.85, 1.15))
+def test_a_small_change_across_a_limit_is_not_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 1.06 across the end of the tolerance, 1.1: by 5 % or less it may be noise."""
+    values = {"photons.read_noise_electrons": 1.11, "photons.band_nm": 1.12}
+    rows = moved_with(tmp_path, monkeypatch, values, unmoved=1.06)
     assert rows[f"{AZURE} photons.read_noise_electrons"].verdict == "untested"
     assert rows[f"{AZURE} photons.band_nm"].verdict == "noticed"
 
