@@ -496,7 +496,8 @@ POSTERIOR = Table(
         ),
         Column("posterior_share", "posterior", note="posterior probability"),
         *_columns(
-            posterior_low="lower end of its 95 % interval over set-ups; empty for a set-up",
+            posterior_low="lower end of its interval over set-ups, at 95 % for all values jointly; "
+            "empty for a set-up",
             posterior_high="upper end of that interval",
         ),
     ),

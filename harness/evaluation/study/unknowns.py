@@ -4,7 +4,8 @@ One model is fitted to all drawn boards: logit POD = (ln a - mu) / s, where mu a
 in the unknowns, each coded with mean 0 over its values. So every board tells of every unknown; an
 unknown multiplies a50 by a factor, and the width of the curve by another. a90 at one value of an
 unknown has the others at the middle of their effects: their average, not their stated values. Weak
-priors keep what hardly any board tells finite. Intervals are percentiles over resampled boards.
+priors keep what hardly any board tells finite. Intervals are percentiles over resampled boards,
+stretched for the coefficients; with 36 boards they hold the truth in 85 to 98 % of studies.
 
 Not modelled: interactions (blur may matter more where nothing stands behind), and effects that
 are not linear over a range, of which a monotone one is still seen."""
@@ -15,8 +16,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
-from harness.evaluation.intervals import CONFIDENCE, Interval, percentiles
+from harness.evaluation.intervals import CONFIDENCE, UPPER, Interval, percentiles
 from harness.evaluation.pod.curve import ascend, link_ppf, logs_of_link, slopes_of_link
 from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.boards import DRAWS, Targets, targets_of, weights_in_blocks
@@ -106,7 +108,8 @@ def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | Non
     redrawn = []
     for (weights,) in weights_in_blocks(draws, (targets.board, "damaged")):
         redrawn.append(_fitted(targets, design, weights, fitted))
-    drawn = np.concatenate(redrawn)
+    stretch = _stretch(len(np.unique(targets.board)), fitted.shape[1])
+    drawn = fitted + stretch * (np.concatenate(redrawn) - fitted)
     pairs = sum(len(of.levels) * (len(of.levels) - 1) // 2 for of in coded)
     effects = []
     first = 1
@@ -132,6 +135,14 @@ def _coded(unknown: DrawnUnknown, board: np.ndarray) -> _Coded:
     levels = unknown.values or ()
     codes = np.vstack([np.eye(len(levels) - 1), -np.ones(len(levels) - 1)])
     return _Coded(unknown, levels, codes, codes[drawn.astype(int)])
+
+
+def _stretch(boards: int, coefficients: int) -> float:
+    """Return by how much resampled coefficients scatter too little: a fit takes up as many degrees
+    of freedom as it has coefficients, and the rest follow Student's t."""
+    degrees = boards - coefficients
+    wider = float(stdtrit(degrees, UPPER) / ndtri(UPPER))
+    return wider * float(np.sqrt(boards / degrees))
 
 
 def _no_effects(targets: Targets, coded: Sequence[_Coded]) -> str:
@@ -164,6 +175,7 @@ def _fitted(
     precision = np.full(2 * columns, 1 / SHIFT**2)
     precision[0] = 0.0
     precision[columns:] = 1 / WIDTH**2
+    precision *= targets.inspections.mean()  # repeats of the noise are no further targets
 
     def climb(b: np.ndarray, studies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return log-posteriors and scoring steps at b (d, 2 k), for `ascend`."""

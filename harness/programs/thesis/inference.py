@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from harness.evaluation.intervals import RESAMPLES, Interval, percentiles
+from harness.evaluation.intervals import CONFIDENCE, RESAMPLES, Interval, percentiles
 from harness.evaluation.maps import MANY
 from harness.programs.thesis.cameras import CAMERA
 from harness.programs.thesis.claims import (
@@ -29,7 +29,7 @@ FEWEST_SET_UPS = 20
 """Fewest set-ups for which a posterior is computed."""
 DOUBTED = 0.5
 """A value is doubted if its posterior probability is less than this share of its prior one, and if
-the interval of the posterior excludes the prior."""
+an interval of the posterior at a confidence that allows for all values excludes the prior."""
 MOST_VALUES = 10
 """An axis with more numbers is one of a range, of which `PARTS` equal parts are judged."""
 PARTS = 3
@@ -62,6 +62,8 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     log_likelihood = _log_likelihood(rows)
     relative = np.exp(log_likelihood - log_likelihood.max())
     share = relative / relative.sum()
+    set_ups = rows.drop_duplicates("variant").set_index("variant")
+    values = sum(len(_values(path, set_ups[path])) for path in axes)
     posterior: list[dict[str, Any]] = [
         {
             "axis": SET_UP,
@@ -74,7 +76,6 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
         }
         for name, probability in share.sort_values(ascending=False, kind="stable").items()
     ]
-    set_ups = rows.drop_duplicates("variant").set_index("variant")
     for path, name in names_of(list(axes)).items():
         possible = set_ups
         kind = KIND_WITH.get(path)
@@ -83,7 +84,7 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
             name = f"{name} of {kind} holes"
         for value, has_value in _values(path, possible[path]).items():
             group = possible.index[has_value]
-            interval = _interval(relative[possible.index].to_numpy(), has_value)
+            interval = _interval(relative[possible.index].to_numpy(), has_value, values)
             posterior.append(
                 {
                     "axis": name,
@@ -118,12 +119,14 @@ def _values(path: str, column: pd.Series) -> dict[str, np.ndarray]:
     return words
 
 
-def _interval(relative: np.ndarray, has_value: np.ndarray) -> Interval:
-    """Return the 95 % interval of a value's posterior share over resampled set-ups, from their
-    relative likelihoods (n,) and which of them (n,) have the value."""
+def _interval(relative: np.ndarray, has_value: np.ndarray, values: int) -> Interval:
+    """Return the interval of a value's posterior share over resampled set-ups, from their relative
+    likelihoods (n,) and which of them (n,) have the value: one that holds for all of so many
+    ``values`` at 95 %."""
     stream = random_stream(0, "set-ups drawn again", len(relative))
     times = stream.multinomial(len(relative), np.full(len(relative), 1 / len(relative)), RESAMPLES)
-    return percentiles((times @ (relative * has_value)) / (times @ relative))
+    shares = (times @ (relative * has_value)) / (times @ relative)
+    return percentiles(shares, 1 - (1 - CONFIDENCE) / values)
 
 
 def _log_likelihood(rows: pd.DataFrame) -> pd.Series:

@@ -69,7 +69,7 @@ def test_a_sentence_without_effects():
     assert "no unknown moves it beyond chance (at most " in sentence
     few = result_with(drawn_set_up(boards=12))
     (sentence,) = unknown_sentences(few)
-    assert sentence.endswith("12 boards are too few to tell the unknowns apart; 18 are needed.")
+    assert sentence.endswith("12 boards are too few to tell the unknowns apart; 15 are needed.")
 
 
 def test_a_study_without_unknowns_says_nothing_of_them():

@@ -62,7 +62,7 @@ def test_the_sign_of_an_effect_is_that_of_the_range(many):
 
 def test_intervals_cover_the_truth():
     """36 boards, 40 studies: each interval of a backing holds its a90, and that of the blur its
-    factor, in most of them (binomial: 33 or more of 40 at 95 %)."""
+    factor, in 85 to 98 % of them (binomial: 31 or more of 40)."""
     covered = np.zeros(4, int)
     found = 0
     for seed in range(40):
@@ -75,7 +75,7 @@ def test_intervals_cover_the_truth():
         factor = BLUR_FACTOR if blur.most == 1 else 1 / BLUR_FACTOR
         covered[3] += interval.low <= factor <= interval.high
         found += by_key[BACKING].beyond_chance
-    assert covered.min() >= 33
+    assert covered.min() >= 31
     assert found >= 36
 
 
@@ -115,10 +115,10 @@ def test_repeats_of_the_noise_are_no_further_boards():
 
 def test_without_unknowns_or_without_enough_boards():
     assert over_unknowns(study_record().set_ups[0]) is None
-    few = over_unknowns(drawn_set_up(boards=17))
-    assert few.why == "17 boards are too few to tell the unknowns apart; 18 are needed"
+    few = over_unknowns(drawn_set_up(boards=14))
+    assert few.why == "14 boards are too few to tell the unknowns apart; 15 are needed"
     assert few.effects == ()
-    assert over_unknowns(drawn_set_up(boards=18), draws=20).why == ""
+    assert over_unknowns(drawn_set_up(boards=15), draws=20).why == ""
     record = drawn_set_up()
     all_found = replace(record.inspected, hit=np.ones_like(record.inspected.hit))
     assert over_unknowns(replace(record, inspected=all_found)).why

@@ -4,6 +4,7 @@ draw of set-ups."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -61,11 +62,15 @@ def test_the_posterior_by_hand(results):
     assert depth["posterior_share"] == pytest.approx(right / (right + wrong))
     sentence = borne_out_if(table)
     assert sentence.startswith(
-        "The thesis' outcome is borne out if blind depth is 2 mm (of 22 set-ups;"
+        "Of what the thesis leaves open, its outcome speaks against blind depth of 4 mm, and "
+        "does not decide distance (a value is doubtful"
     )
+    assert "would need another cause" in sentence
     assert "probability of 0.098" in sentence
     certain_of_nothing = table.assign(posterior_share=table["prior_share"])
-    assert "no particular fact holds" in borne_out_if(certain_of_nothing)
+    assert "speaks against nothing" in borne_out_if(certain_of_nothing)
+    of_few = table.assign(posterior_high=1.0)
+    assert "speaks against nothing" in borne_out_if(of_few)
 
 
 def test_a_depth_of_blind_holes_says_nothing_of_through_holes(results):
@@ -90,11 +95,15 @@ def test_a_depth_of_blind_holes_says_nothing_of_through_holes(results):
     assert depths["posterior_share"].tolist() == pytest.approx(
         [right / (right + wrong), wrong / (right + wrong)]
     )
-    assert "blind depth of blind holes is 2 mm (of 22 set-ups" in borne_out_if(table)
+    assert "blind depth of blind holes of 4 mm" in borne_out_if(table)
+    is_blind = table["value"] == "blind"
     without = table.assign(
-        posterior_share=table["posterior_share"].mask(table["value"] == "blind", 0.0)
+        posterior_share=table["posterior_share"].mask(is_blind, 0.0),
+        posterior_high=table["posterior_high"].mask(is_blind, 0.0),
     )
-    assert "hole kind is through (of 22" in borne_out_if(without)
+    sentence = borne_out_if(without)
+    assert "speaks against hole kind of blind" in sentence
+    assert "of blind holes" not in sentence
 
 
 def test_no_posterior_of_few_set_ups_or_of_one_number_of_frames(results):
@@ -125,14 +134,14 @@ def test_a_value_is_doubted_below_half_of_its_prior(results, ratio, doubted):
     is_deep = table["value"].str.startswith("4 mm")
     shares[is_deep] *= ratio
     sentence = borne_out_if(table.assign(posterior_share=shares))
-    assert ("blind depth is 2 mm" in sentence) == doubted
+    assert ("blind depth of 4 mm" in sentence) == doubted
 
 
 def test_the_page_begins_with_the_sentence(results):
     page = set_ups_html(results, [], About(provenance(), "", "Inference", THESIS))
     answer = page.split('<p class="answer">')[1]
     assert (
-        answer.startswith("The thesis&#39; outcome is borne out if")
+        answer.startswith("Of what the thesis leaves open, its outcome speaks against")
         and "What would make the thesis true" in page
     )
 
@@ -144,12 +153,32 @@ def test_set_ups_that_fill_no_grid_stand_one_below_the_other(results):
     assert layout.columns == () and len(layout.rows) == 11
 
 
-def test_set_ups_are_drawn_at_random_and_alike_ones_once():
-    fewer = load_experiment("experiments/thesis_inference.yaml", [f"draws={20}"])
-    further_draws = load_experiment("experiments/thesis_inference.yaml", [f"draws={24}"])
+def test_set_ups_are_drawn_at_random_and_alike_ones_once(tmp_path):
+    axes = {"sweep": {"source.target.distance_m": [0.6 + 0.01 * i for i in range(30)]}}
+    text = Path("experiments/thesis_inference.yaml").read_text().partition("unknowns:")[0]
+    frames = "  capture.frames: [1, 50]\n"
+    values = axes["sweep"]["source.target.distance_m"]
+    text += f"sweep:\n  source.target.distance_m: {values}\n{frames}"
+    (tmp_path / "drawn.yaml").write_text(text)
+    fewer = load_experiment(tmp_path / "drawn.yaml", ["draws=20"])
+    further_draws = load_experiment(tmp_path / "drawn.yaml", ["draws=24"])
     names = [
         {point.variant for point in experiment.points} for experiment in (fewer, further_draws)
     ]
-    assert names[0] < names[1] and 20 < len(names[1]) <= 24
+    assert names[0] < names[1] and len(names[1]) == 24
     assert len(fewer.points) == 2 * len(names[0])
     assert {point.config.capture.frames for point in fewer.points} == {1, 50}
+
+
+def test_numbers_of_a_range_are_judged_in_three_parts(results):
+    """22 set-ups, each at a distance of its own; those of the nearest third agree."""
+    summary = summarise_holes(results.holes, PATHS)
+    names = {name: number for number, name in enumerate(dict.fromkeys(summary["variant"]))}
+    far = summary["variant"].map(names)
+    table = posterior_of(summary.assign(**{PATHS[1]: 0.5 + 0.01 * far}), PATHS)
+    parts = table[table["axis"] == "distance"]
+    assert parts["value"].tolist() == ["0.5 to 0.57 m", "0.57 to 0.64 m", "0.64 to 0.71 m"]
+    assert parts["prior_share"].sum() == pytest.approx(1)
+    assert parts["posterior_share"].iloc[0] > parts["posterior_share"].iloc[2]
+    assert (parts["posterior_low"] <= parts["posterior_share"]).all()
+    assert (parts["posterior_share"] <= parts["posterior_high"]).all()
