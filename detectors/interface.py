@@ -20,9 +20,9 @@ class Evidence:
     """(h, w): the threshold below which the pixel counts as damage; NaN where the detector does
     not judge."""
     residual_m: np.ndarray
-    """(h, w): distance along the viewing axis behind (+) or before (-) the fitted surface."""
+    """(h, w): z of the point less that of the fitted surface: + behind it, - before it."""
     surface_z_m: np.ndarray
-    """(h, w): z of the fitted surface."""
+    """(h, w): z of the fitted surface, where ``residual_along`` says."""
     scale_m: float
     """Standard deviation that corresponds to one unit of score."""
     notes: dict[str, Any] = field(default_factory=dict)
@@ -36,6 +36,9 @@ class Evidence:
     unit: str = ""
     """The unit of score in words, if scores are not residuals over a deviation; ``scale_m`` is
     then its least value at a typical point."""
+    residual_along: Literal["ray", "axis"] = "ray"
+    """Where the surface's z is taken: "ray" where the pixel's line of sight meets the surface,
+    "axis" at the point's own x and y. On a tilted surface they differ off the optical axis."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +140,9 @@ class Measurement:
     along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,): direction of the longer side."""
     normal_share: float = np.nan
-    """Depth normal to the surface over depth along the viewing axis: a cosine."""
+    """Depth normal to the surface over the residual."""
     sight_share: float = np.nan
-    """Depth along the line of sight over depth along the viewing axis."""
+    """Depth along the line of sight over the residual."""
     shape: str = ""
     """The shape that fits (`detectors.findings.shapes`), "ragged" if none does, or empty if the
     blur hides it."""

@@ -269,9 +269,9 @@ class _Surroundings:
     reach_px: int
     """Half of the blur."""
     normal_share: float
-    """Depth normal to the surface over depth along the optical axis."""
+    """Depth normal to the surface over the residual."""
     sight_share: float
-    """Depth along the line of sight over depth along the optical axis."""
+    """Depth along the line of sight over the residual."""
     u0: float
     """Centroid of the detection's pixels in the patch, along columns."""
     v0: float
@@ -398,9 +398,14 @@ def _surroundings(
         shared_px=blur_px,
     )
     normal = normal_of(per_px_m)
-    ray = np.array([0.0, 0.0, 1.0])
+    axis = np.array([0.0, 0.0, 1.0])
+    ray = axis
     if cloud.projection == "central":
         ray = origin_m / origin_m[2]
+    normal_by_ray = float(abs(normal @ ray) / math.hypot(*normal))
+    normal_share = normal_by_ray
+    if evidence.residual_along == "axis":
+        normal_share = float(abs(normal @ axis) / math.hypot(*normal))
     return _Surroundings(
         patch=patch,
         own=own,
@@ -411,8 +416,8 @@ def _surroundings(
         sign=sign,
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
-        normal_share=float(abs(normal @ ray) / math.hypot(*normal)),
-        sight_share=float(np.linalg.norm(ray)),
+        normal_share=normal_share,
+        sight_share=normal_share / normal_by_ray * float(np.linalg.norm(ray)),
         u0=u0,
         v0=v0,
         origin_m=origin_m,

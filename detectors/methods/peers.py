@@ -62,7 +62,7 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
     settings_type: ClassVar[type[PlaneRansacConfig]] = PlaneRansacConfig
     name = "plane_ransac"
-    version = 3
+    version = 4
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |residual| / deviation in the crop. Raises UserError if its points determine no
@@ -87,6 +87,7 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
             surface_z_m=on_grid(fitted_m, mask),
             scale_m=scale_m,
             notes={"surface": "plane", "points": len(points)},
+            residual_along="axis",
         )
 
     def _plane(self, points: np.ndarray) -> tuple[float, ...]:
@@ -134,7 +135,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
     settings_type: ClassVar[type[M3c2Config]] = M3c2Config
     name = "m3c2"
-    version = 3
+    version = 4
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |distance| / deviation in the crop. Raises UserError if no point has a
@@ -304,7 +305,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
-    version = 3
+    version = 4
 
     def __init__(
         self,

@@ -40,7 +40,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 7
+    version = 8
 
     @property
     def default_threshold(self) -> float | None:
@@ -76,6 +76,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
                 "spread_m": spread * median_of(deviation),
                 "floor_m": floor_m,
             },
+            residual_along="axis",
         )
 
     def _spread(self, residuals: np.ndarray, z_m: np.ndarray) -> float:

@@ -27,6 +27,7 @@ from detectors.surfaces.surface import (
     BISQUARE_TUNING,
     Fit,
     SurfaceConfig,
+    along_rays,
     bisquare_weights,
     fit_surface,
     polynomial,
@@ -245,7 +246,7 @@ def _shape_of(
     both, and the profile that it contains. ``rounding_m``: deviation that rounding leaves in the
     points."""
     sample = points[:: max(1, len(points) // 8192)]
-    _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"))
+    _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"), cells.central)
     cells = cells.refreshed(points[:, 2] - start(points), start)
     shapes, errors = _formula_shapes(cells)
     worth = WORTH * cells.pixel_noise
@@ -326,8 +327,9 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
-def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> tuple[str, Fit]:
-    """Return the name and the fit of a surface whose kind is stated."""
+def _stated(points: np.ndarray, config: SurfaceConfig, central: bool) -> tuple[str, Fit]:
+    """Return the name and the fit of a surface whose kind is stated. ``central``: rays leave the
+    origin, else along z."""
     if config.reference is not None:
         return laid_on(points, config.reference, central)
     surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
@@ -335,7 +337,10 @@ def _stated(points: np.ndarray, config: SurfaceConfig, central: bool = True) -> 
     def z_at(queries: np.ndarray) -> np.ndarray:
         return surface.evaluate(queries[:, 0], queries[:, 1])
 
-    return f"degree {config.degree}, {surface.note}", z_at
+    name = f"degree {config.degree}, {surface.note}"
+    if central and points[:, 2].min() > 0:
+        return name, along_rays(z_at)
+    return name, z_at
 
 
 def _cells(points: np.ndarray, cloud: Cloud) -> _Cells | None:
@@ -454,14 +459,21 @@ def _with_free_form(cells: _Cells, best: _Shape, base: _Shape, config: SurfaceCo
 
 def _formulas(central: bool) -> list[tuple[str, Any]]:
     """Return the names of the shapes with few coefficients and their fits, simplest first."""
+    of_degree = partial(_polynomial, central=central)
     formulas: list[tuple[str, Any]] = [
-        ("plane", partial(polynomial, degree=1)),
-        ("polynomial of degree 2", partial(polynomial, degree=2)),
+        ("plane", partial(of_degree, degree=1)),
+        ("polynomial of degree 2", partial(of_degree, degree=2)),
         ("quadric", partial(quadric, central=central)),
     ]
     for degree in (3, 4, 5):
-        formulas.append((f"polynomial of degree {degree}", partial(polynomial, degree=degree)))
+        formulas.append((f"polynomial of degree {degree}", partial(of_degree, degree=degree)))
     return formulas
+
+
+def _polynomial(points: np.ndarray, weights: np.ndarray, degree: int, central: bool) -> Fit:
+    """Fit z(x, y) to points (c, 3). ``central``: rays leave the origin, else along z."""
+    fit = polynomial(points, weights, degree)
+    return along_rays(fit) if central else fit
 
 
 def _wavelengths(cells: _Cells, config: SurfaceConfig) -> list[float]:

@@ -487,8 +487,27 @@ def _concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -
 Fit = Callable[[np.ndarray], np.ndarray]
 """Maps measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the
 surface."""
+RAY_STEP = 1e-4
+"""Share of a point's range by which it is moved along its ray to see how the surface falls off."""
+LEAST_OPENING = 0.05
+"""Least slope between a ray and the surface that counts: 87 degrees off the normal, where nothing
+is judged."""
 # share of the largest diagonal element, added to every one so that normal equations stay regular
 RIDGE = 1e-9
+
+
+def along_rays(fit: Fit) -> Fit:
+    """Return a ``fit`` of z at points' own x and y as one of z where the points' rays from the
+    origin meet the surface: to first order in the distance between, exactly for planes. A point
+    behind a tilted surface has another x and y than the place that its ray meets."""
+
+    def z_at(points: np.ndarray) -> np.ndarray:
+        z = points[:, 2]
+        below = fit(points)
+        slope = (fit(points * (1.0 + RAY_STEP)) - below) / (RAY_STEP * z)
+        return np.asarray(z + (below - z) / np.maximum(1.0 - slope, LEAST_OPENING))
+
+    return z_at
 
 
 def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
