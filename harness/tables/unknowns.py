@@ -1,4 +1,4 @@
-"""What a study says of facts that nobody has measured: the table of their effects, sentences."""
+"""Facts that nobody has measured, in a study: the table of their effects, and sentences."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How far each unknown alone moves a90, from the boards of which each has unknowns of its own.
+"""The effect of each unknown alone on a90, from boards of which each has unknowns of its own.
 
 One model is fitted to all drawn boards: logit POD = (ln a - mu) / s, where mu and ln s are linear
 in the unknowns, each coded with mean 0 over its values. So every board tells of every unknown; an
@@ -38,7 +38,7 @@ LEAST_BOARDS = 3
 
 @dataclass(frozen=True, eq=False)
 class UnknownEffect:
-    """What one unknown does to a90."""
+    """The effect of one unknown on a90."""
 
     unknown: DrawnUnknown
     """The unknown."""
@@ -62,7 +62,7 @@ class UnknownEffect:
 
 @dataclass(frozen=True, eq=False)
 class OverUnknowns:
-    """What all unknowns of one set-up do to a90."""
+    """The effects of all unknowns of one set-up on a90."""
 
     effects: tuple[UnknownEffect, ...]
     """The unknowns, that with the largest factor first."""

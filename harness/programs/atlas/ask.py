@@ -360,12 +360,15 @@ def _basis(rows: Sequence[Row], about: Mapping[str, Any]) -> str:
 
 def _assumed(kind: str, rows: Sequence[Row]) -> list[str]:
     """Say what the limits assume that nobody has measured, and how far that moves them, by the
-    study of unknowns that comes with tofpod."""
+    study of unknowns that comes with tofpod; nothing if it does not come with one."""
     import pandas as pd
 
     from harness.programs.atlas.assumptions import STORED_UNKNOWNS, assumed
 
-    table = pd.read_parquet(shipped("baselines") / STORED_UNKNOWNS)
+    file = shipped("baselines") / STORED_UNKNOWNS
+    if not file.is_file():
+        return []
+    table = pd.read_parquet(file)
     frames = int(max(row.position["frames"] for row in rows))
     axes = [axis for row in rows for axis in row.surface.grid]
     return assumed(table, kind, rows[0].surface.detector, frames, axes)

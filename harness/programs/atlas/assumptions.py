@@ -1,5 +1,5 @@
-"""What limits assume that nobody has measured, and how far each of these facts moves a90, from the
-table ``unknowns.parquet`` of a study of unknowns (`experiments/detection_limit.yaml`)."""
+"""Facts that limits assume and nobody has measured, and how far each moves a90, from the table
+``unknowns.parquet`` of a study of unknowns (`experiments/detection_limit.yaml`)."""
 
 from collections.abc import Collection
 
