@@ -52,21 +52,19 @@ def table():
 
 def test_the_stated_values_and_the_factors(table):
     stated, moved = assumed(table, "through", "matched", 50, ["distance_m"])
-    assert stated == (
-        "Assumed, not measured: blur: 0 px; backing: distance 20 mm; albedo 850: 0.6."
-    )
+    assert stated == ("Assumed, not measured: blur 0 px, backing distance 20 mm, albedo 850 0.6.")
     assert moved == (
-        "How far each alone moves a90 (through-holes, matched, 50 frames): backing by a factor of "
-        "1.70, blur by a factor of 1.40, no other beyond chance (at most albedo 850, 1.10)."
+        "They move a90 (through-holes, matched, 50 frames): backing × 1.70, blur × 1.40, "
+        "no other beyond chance (at most albedo 850, 1.10)."
     )
 
 
 def test_the_nearest_set_up_answers(table):
-    for frames, first in ((5, "none beyond chance (at most blur, 1.20)"), (40, "backing by")):
+    for frames, first in ((5, "none beyond chance (at most blur, 1.20)"), (40, "backing ×")):
         _, moved = assumed(table, "through", "matched", frames, [])
         assert f"): {first}" in moved
     _, moved = assumed(table, "through", "thesis", 50, [])
-    assert "(through-holes, thesis, 50 frames): backing by a factor of 2.50." in moved
+    assert "(through-holes, thesis, 50 frames): backing × 2.50." in moved
 
 
 def test_what_is_asked_is_not_assumed(table):
@@ -82,4 +80,4 @@ def test_other_damage_is_not_computed(table):
 def test_the_table_that_comes_with_tofpod():
     table = pd.read_parquet(shipped("baselines") / STORED_UNKNOWNS)
     _, moved = assumed(table, "through", "matched", 50, [])
-    assert "backing by a factor of" in moved
+    assert "backing ×" in moved
