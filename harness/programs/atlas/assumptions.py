@@ -24,8 +24,8 @@ def assumed(
     rows = table[~table["key"].isin(asked)]
     names = names_of(sorted(set(rows["key"])))
     facts = rows.drop_duplicates("key").set_index("key")["stated"].sort_index()
-    stated = [f"{names[str(key)]}: {value}" for key, value in facts.items()]
-    sentences = [f"Assumed, not measured: {'; '.join(stated)}."]
+    stated = [f"{names[str(key)]} {value}" for key, value in facts.items()]
+    sentences = [f"Assumed, not measured: {', '.join(stated)}."]
     kinds = rows[DAMAGE].map(lambda damage: damage_of(damage)[0])
     nearest = rows[kinds == kind]
     if nearest.empty:
@@ -37,7 +37,7 @@ def assumed(
     effects = nearest.sort_values("rank").drop_duplicates("key")
     first = effects.iloc[0]
     set_up = f"{damage_words(kind)}s, {first['detector']}, {many(int(first['frames']), 'frame')}"
-    return [*sentences, f"How far each alone moves a90 ({set_up}): {_moved(effects, names)}."]
+    return [*sentences, f"They move a90 ({set_up}): {_moved(effects, names)}."]
 
 
 def _moved(effects: pd.DataFrame, names: dict[str, str]) -> str:
@@ -46,7 +46,7 @@ def _moved(effects: pd.DataFrame, names: dict[str, str]) -> str:
     is_certain = effects["beyond_chance"].astype(bool)
     parts = []
     for effect in effects[is_certain].itertuples():
-        parts.append(f"{names[str(effect.key)]} by a factor of {effect.factor:.2f}")
+        parts.append(f"{names[str(effect.key)]} × {effect.factor:.2f}")
     others = effects[~is_certain]
     if not others.empty:
         largest = others.iloc[0]

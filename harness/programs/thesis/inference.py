@@ -34,7 +34,7 @@ MOST_VALUES = 10
 """An axis with more numbers is one of a range, of which `PARTS` equal parts are judged."""
 PARTS = 3
 NO_MARGIN = (
-    "The threshold is the highest outlier of the simulated cloud, and on real walls the highest "
+    "The threshold is the highest outlier of a simulated cloud, and on real walls the highest "
     "residual is 0.95 to 1.24 times that: a threshold 1.25 to 2 times as high would need another "
     "cause, such as a margin left by hand."
 )

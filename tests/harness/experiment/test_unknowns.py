@@ -194,7 +194,7 @@ def test_set_ups_with_drawn_unknowns():
     assert backings == dict.fromkeys((0.0, 20.0, 100.0, 500.0, None), 8)
     poses = {(source.target.tilt_x_deg, source.target.offset_x_mm) for source in sources}
     assert len(poses) == 40
-    assert {point.config.threshold.k for point in points} == {1.0}
+    assert {point.config.threshold.calibrate.repeats for point in points} == {1}
 
 
 def test_a_first_look_leaves_the_unknowns_of_a_study_out():

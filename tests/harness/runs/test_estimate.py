@@ -21,6 +21,7 @@ STUDY = [
     "study.hole_free_boards=2",
     "threshold.calibrate.boards=20",
     "sweep={capture.frames: [1, 50]}",
+    "unknowns=[]",
 ]
 
 

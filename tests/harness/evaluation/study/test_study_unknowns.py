@@ -10,12 +10,14 @@ import pytest
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.unknowns import over_unknowns
 from tests.support.drawn_unknowns import (
+    A50_MM,
     BACKING,
     BACKINGS,
     BLUR,
     BLUR_FACTOR,
     BLUR_PX,
     IDLE,
+    WIDTH,
     drawn_set_up,
     true_a90_mm,
 )
@@ -42,6 +44,14 @@ def test_every_value_has_its_own_a90_and_its_own_slope(many):
     assert idle.factor == pytest.approx(1.0, abs=0.03)
     assert [effect.beyond_chance for effect in many.effects] == [True, True, False]
     assert many.deciding == (backing, blur)
+
+
+def test_the_others_are_at_their_average(many):
+    """At the ends of the blur, ln a50 and ln of the width are the means over the backings."""
+    middle = np.exp(np.log(A50_MM).mean() + np.log(9.0) * np.exp(np.log(WIDTH).mean()))
+    expected_mm = middle * BLUR_FACTOR ** np.array([-0.5, 0.5])
+    blur = many.effects[1]
+    assert blur.a90_mm == pytest.approx(expected_mm, rel=0.03)
 
 
 def test_the_range_is_that_of_the_unknowns_that_matter(many):
