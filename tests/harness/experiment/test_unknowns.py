@@ -153,10 +153,11 @@ def test_the_boards_have_what_is_drawn_for_them(tmp_path):
         assert family == stated.config.simulated.target.model_copy(update=same)
 
 
-def test_the_plan_is_exactly_twice_a_plain_study(tmp_path):
+def test_the_plan_is_at_most_twice_a_plain_study(tmp_path):
     plain = plan_of(loaded(tmp_path, STUDY), tmp_path)
     plan = plan_of(loaded(tmp_path, STUDY + UNKNOWN_YAML), tmp_path)
-    assert len(plan.renders) == 2 * len(plain.renders)
+    # a board that draws what is stated shares the render
+    assert 1.5 * len(plain.renders) < len(plan.renders) <= 2 * len(plain.renders)
     trials = [
         sum(group.most_repeats(batch) for group in planned.groups for batch in group.batches)
         for planned in (plain, plan)

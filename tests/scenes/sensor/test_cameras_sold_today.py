@@ -110,7 +110,7 @@ def noise_by_brightness(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def figure(name: str) -> Figure:
-    return next(figure for figure in read_figures() if figure.name == name)
+    return next(figure for figure in read_figures().figures if figure.name == name)
 
 
 @pytest.mark.parametrize(
