@@ -53,14 +53,16 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     headline = unknown_headline(result)
     others = [text for text in unknown_sentences(result) if text != headline]
     parts += ["", *others] if others else []
-    return [*parts, "", _answer(result)]
+    return [*parts, "", " ".join(_answers(result))]
 
 
-def _answer(result: StudyResult) -> str:
+def _answers(result: StudyResult) -> list[str]:
     """Return the answer at the stated values and, of a study with unknowns, before it the range of
     the best set-up over them."""
     stated = [limit for limit in result.limits if not limit.record.drawn]
-    return f"{unknown_headline(result)} {study_answer(stated)}".strip()
+    headline = unknown_headline(result)
+    answer = study_answer(stated)
+    return [headline, answer] if headline else [answer]
 
 
 def study_html(
@@ -76,7 +78,10 @@ def study_html(
     rows = study.study_tables(result)
     inspections = [limit.record.inspected for limit in limits]
     groups = {f"axis-{n}": group for n, group in enumerate(study.axis_groups(result.axes), 1)}
-    shown = with_room(result.set_ups)
+    # limits over unknowns have a section of their own
+    stated = [set_up for set_up in result.set_ups if not set_up.limit.record.drawn]
+    shown = with_room(stated)
+    first_answer, *further_answers = map(unbroken, _answers(result))
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
     figures |= _curves(shown)
     figures |= _tornadoes(result)
@@ -89,7 +94,8 @@ def study_html(
 
     return template("study.html").render(
         title=title,
-        answer=unbroken(_answer(result)),
+        answer=first_answer,
+        further_answers=further_answers,
         conditions=result.conditions,
         rule=(
             f"Fixed in advance: a damage is found {result.record.hit_rule}, and no finding counts"
@@ -97,7 +103,7 @@ def study_html(
         ),
         limits=limits_grid(limits).html() if limits else None,
         limit_notes=[unbroken(text) for text in limit_notes(limits)],
-        set_ups=len(limits),
+        set_ups=len(stated),
         most_curves=MOST_CURVES,
         scene=scene_svg(result.facts),
         unknowns=_unknown_parts(result),
