@@ -303,11 +303,12 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
             fix="give the lens of the depth images (or of the colour camera they are aligned to)",
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
-    side = across / width
-    fx = fx / side
-    fy = fy / side
-    cx = (cx + 0.5) / side - 0.5
-    cy = (cy + 0.5) / side - 0.5
+    if across != width:  # also because the shift by half a pixel and back may round
+        side = across / width
+        fx = fx / side
+        fy = fy / side
+        cx = (cx + 0.5) / side - 0.5
+        cy = (cy + 0.5) / side - 0.5
     # no lens of these images has a mirrored or normalised focal length, or a centre far outside
     is_near = -width < cx < 2 * width and -height < cy < 2 * height
     is_focal = 0.1 * width < fx < 100 * width and 0.1 * width < fy < 100 * width
