@@ -54,9 +54,9 @@ def _draw_bar(axes: Axes, row: int, effect: UnknownEffect, most_mm: float) -> No
     """Draw the bar of an unknown in a row; pale if its effect may be chance."""
     colour = BLUE if effect.beyond_chance else PALE
     sizes_mm = np.minimum(effect.a90_mm, most_mm)
-    least_mm = sizes_mm[effect.least]
-    axes.barh(row, sizes_mm[effect.most] - least_mm, BAR, left=least_mm, color=colour)
-    for level, side in ((effect.least, -1), (effect.most, 1)):
+    least_mm = sizes_mm[effect.lowest_level]
+    axes.barh(row, sizes_mm[effect.highest_level] - least_mm, BAR, left=least_mm, color=colour)
+    for level, side in ((effect.lowest_level, -1), (effect.highest_level, 1)):
         ends = effect.intervals_mm[level]
         low_mm = min(ends.low, most_mm)
         high_mm = min(ends.high, most_mm)

@@ -10,6 +10,7 @@ stretched for the coefficients; with 36 boards they hold the truth in 85 to 98 %
 Not modelled: interactions (blur may matter more where nothing stands behind), and effects that
 are not linear over a range, of which a monotone one is still seen."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -48,10 +49,10 @@ class UnknownEffect:
     """a90 (m,) at each of them, averaged over the other unknowns."""
     intervals_mm: tuple[Interval, ...]
     """95 % interval (m,) of each of these over boards."""
-    least: int
-    """The level with the smallest a90."""
-    most: int
-    """The level with the largest a90."""
+    lowest_level: int
+    """The index of the level with the smallest a90."""
+    highest_level: int
+    """The index of the level with the largest a90."""
     factor: float
     """The largest a90 over the smallest."""
     factor_interval: Interval
@@ -85,7 +86,9 @@ class _Coded:
     """An unknown as columns of a design."""
 
     unknown: DrawnUnknown
+    """The unknown."""
     levels: tuple[Any, ...]
+    """Its values (m,), or the ends of its range."""
     codes: np.ndarray
     """Codes (m, k) of the levels, whose mean over all values is 0."""
     columns: np.ndarray
@@ -99,42 +102,61 @@ def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | Non
         return None
     inspected = record.inspected
     targets = targets_of(inspected.board, inspected.hole, inspected.size_mm, inspected.hit)
-    coded = [_coded(unknown, targets.board) for unknown in record.drawn]
-    if why := _no_effects(targets, coded):
-        return OverUnknowns((), np.nan, np.nan, why)
-    design = np.hstack([np.ones((len(targets.board), 1)), *(of.columns for of in coded)])
-    once = np.ones((1, len(targets.board)))
-    fitted = _fitted(targets, design, once, None)
-    redrawn = []
-    for (weights,) in weights_in_blocks(draws, (targets.board, "damaged")):
-        redrawn.append(_fitted(targets, design, weights, fitted))
-    stretch = _stretch(len(np.unique(targets.board)), fitted.shape[1])
-    drawn = fitted + stretch * (np.concatenate(redrawn) - fitted)
-    pairs = sum(len(of.levels) * (len(of.levels) - 1) // 2 for of in coded)
+    coded_unknowns = [_coded(unknown, targets.board) for unknown in record.drawn]
+    why = _no_effects(targets, coded_unknowns)
+    if why:
+        return OverUnknowns(effects=(), lowest_mm=np.nan, highest_mm=np.nan, why=why)
+    constant = np.ones((len(targets.board), 1))
+    design = np.hstack([constant, *[coded.columns for coded in coded_unknowns]])
+    every_target_once = np.ones((1, len(targets.board)))
+    fitted = _fitted(targets, design, every_target_once, None)
+    resampled = _resampled(targets, design, fitted, draws)
+
+    pairs = sum(math.comb(len(coded.levels), 2) for coded in coded_unknowns)
     effects = []
-    first = 1
-    for of in coded:
-        rows = np.zeros((len(of.levels), design.shape[1]))
-        rows[:, first : first + of.codes.shape[1]] = of.codes
+    first_column = 1
+    for coded in coded_unknowns:
+        end_column = first_column + coded.codes.shape[1]
+        rows = np.zeros((len(coded.levels), design.shape[1]))
         rows[:, 0] = 1.0
-        first += of.codes.shape[1]
-        effects.append(_effect(of, _a90_mm(fitted, rows), _a90_mm(drawn, rows), pairs))
-    lowest_mm, highest_mm = _range_mm(fitted, coded, effects)
+        rows[:, first_column:end_column] = coded.codes
+        first_column = end_column
+        effects.append(_effect(coded, _a90_mm(fitted, rows), _a90_mm(resampled, rows), pairs))
+    lowest_mm, highest_mm = _range_mm(fitted, coded_unknowns, effects)
     effects.sort(key=lambda effect: -effect.factor)
     return OverUnknowns(tuple(effects), lowest_mm, highest_mm)
+
+
+def _resampled(targets: Targets, design: np.ndarray, fitted: np.ndarray, draws: int) -> np.ndarray:
+    """Return the coefficients (draws, 2 k) of resampled boards, stretched about those of all boards
+    ``fitted`` (1, 2 k)."""
+    blocks = []
+    for (weights,) in weights_in_blocks(draws, (targets.board, "damaged")):
+        blocks.append(_fitted(targets, design, weights, fitted))
+    stretch = _stretch(len(np.unique(targets.board)), fitted.shape[1])
+    return np.asarray(fitted + stretch * (np.concatenate(blocks) - fitted))
 
 
 def _coded(unknown: DrawnUnknown, board: np.ndarray) -> _Coded:
     """Return an unknown's columns for targets on these boards (n,)."""
     row_of_board = {number: row for row, number in enumerate(unknown.board.tolist())}
-    drawn = unknown.level[[row_of_board[number] for number in board.tolist()]]
+    rows = [row_of_board[number] for number in board.tolist()]
+    drawn = unknown.level[rows]
     if unknown.range is not None:
         low, high = unknown.range
-        columns = ((drawn - (low + high) / 2) / (high - low))[:, None]
-        return _Coded(unknown, unknown.range, np.array([[-0.5], [0.5]]), columns)
+        middle = (low + high) / 2
+        shares = (drawn - middle) / (high - low)
+        return _Coded(
+            unknown=unknown,
+            levels=unknown.range,
+            codes=np.array([[-0.5], [0.5]]),
+            columns=shares[:, None],
+        )
     levels = unknown.values or ()
-    codes = np.vstack([np.eye(len(levels) - 1), -np.ones(len(levels) - 1)])
-    return _Coded(unknown, levels, codes, codes[drawn.astype(int)])
+    # one column for each level but the last, whose code is minus the sum of the others
+    of_last = -np.ones(len(levels) - 1)
+    codes = np.vstack([np.eye(len(levels) - 1), of_last])
+    return _Coded(unknown=unknown, levels=levels, codes=codes, columns=codes[drawn.astype(int)])
 
 
 def _stretch(boards: int, coefficients: int) -> float:
@@ -145,17 +167,17 @@ def _stretch(boards: int, coefficients: int) -> float:
     return wider * float(np.sqrt(boards / degrees))
 
 
-def _no_effects(targets: Targets, coded: Sequence[_Coded]) -> str:
+def _no_effects(targets: Targets, coded_unknowns: Sequence[_Coded]) -> str:
     """Return why the boards allow no effects; empty if they do."""
     hits = targets.hits.sum()
     if hits in (0, targets.inspections.sum()):
         return "all damages had the same outcome"
     if np.ptp(targets.size_mm) == 0:
         return "the size does not vary"
-    columns = 1 + sum(of.codes.shape[1] for of in coded)
+    columns = 1 + sum(coded.codes.shape[1] for coded in coded_unknowns)
     boards = len(np.unique(targets.board))
-    if boards < LEAST_BOARDS * columns:
-        needed = LEAST_BOARDS * columns
+    needed = LEAST_BOARDS * columns
+    if boards < needed:
         return f"{boards} boards are too few to tell the unknowns apart; {needed} are needed"
     return ""
 
@@ -179,21 +201,27 @@ def _fitted(
 
     def climb(b: np.ndarray, studies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return log-posteriors and scoring steps at b (d, 2 k), for `ascend`."""
-        shrunk = np.exp(-b[:, columns:] @ design.T)
-        predictor = (log_size - b[:, :columns] @ design.T) * shrunk
+        of_hits = hits[studies]
+        of_misses = misses[studies]
+        steepness = np.exp(-b[:, columns:] @ design.T)
+        middle = b[:, :columns] @ design.T
+        predictor = (log_size - middle) * steepness
         log_hit, log_miss, _ = logs_of_link(LINK, predictor)
-        value = (hits[studies] * log_hit + misses[studies] * log_miss).sum(axis=1)
-        value = value - 0.5 * (b - expected) ** 2 @ precision
+        log_likelihood = (of_hits * log_hit + of_misses * log_miss).sum(axis=1)
+        departure = b - expected
+        value = log_likelihood - 0.5 * departure**2 @ precision
+
         up, down, _ = slopes_of_link(LINK, predictor)
-        residual = hits[studies] * up - misses[studies] * down
-        weight = (hits[studies] + misses[studies]) * up * down
-        slopes = np.concatenate(
-            [-shrunk[:, :, None] * design, -predictor[:, :, None] * design], axis=2
-        )
-        gradient = (residual[:, None, :] @ slopes)[:, 0] - precision * (b - expected)
+        residual = of_hits * up - of_misses * down
+        weight = (of_hits + of_misses) * up * down
+        by_middle = -steepness[:, :, None] * design
+        by_log_width = -predictor[:, :, None] * design
+        slopes = np.concatenate([by_middle, by_log_width], axis=2)
+        gradient = (residual[:, None, :] @ slopes)[:, 0] - precision * departure
         information = slopes.transpose(0, 2, 1) @ (weight[:, :, None] * slopes)
         information = information + np.diag(precision)
-        return value, np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+        step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+        return value, step
 
     if start is None:
         start = expected[None].copy()
@@ -209,39 +237,43 @@ def _a90_mm(fitted: np.ndarray, rows: np.ndarray) -> np.ndarray:
     columns = rows.shape[1]
     middle = rows @ fitted[:, :columns].T
     width = np.exp(rows @ fitted[:, columns:].T)
-    return np.asarray(np.exp(middle + width * float(link_ppf(LINK, np.array(POD)))))
+    level = float(link_ppf(LINK, np.array(POD)))
+    return np.asarray(np.exp(middle + width * level))
 
 
-def _effect(of: _Coded, a90_mm: np.ndarray, draws_mm: np.ndarray, pairs: int) -> UnknownEffect:
+def _effect(coded: _Coded, a90_mm: np.ndarray, draws_mm: np.ndarray, pairs: int) -> UnknownEffect:
     """Return the effect of an unknown from a90 (m, 1) at its levels, and that of resampled boards
     (m, draws); all unknowns together have so many ``pairs`` of levels."""
     sizes_mm = a90_mm[:, 0]
-    least = int(np.argmin(sizes_mm))
-    most = int(np.argmax(sizes_mm))
-    factors = draws_mm[most] / draws_mm[least]
-    cautious = percentiles(factors, 1 - (1 - CONFIDENCE) / pairs)
+    lowest = int(np.argmin(sizes_mm))
+    highest = int(np.argmax(sizes_mm))
+    factors = draws_mm[highest] / draws_mm[lowest]
+    cautious_confidence = 1 - (1 - CONFIDENCE) / pairs
+    cautious_interval = percentiles(factors, cautious_confidence)
     return UnknownEffect(
-        unknown=of.unknown,
-        levels=of.levels,
+        unknown=coded.unknown,
+        levels=coded.levels,
         a90_mm=sizes_mm,
         intervals_mm=tuple(percentiles(draws) for draws in draws_mm),
-        least=least,
-        most=most,
-        factor=float(sizes_mm[most] / sizes_mm[least]),
+        lowest_level=lowest,
+        highest_level=highest,
+        factor=float(sizes_mm[highest] / sizes_mm[lowest]),
         factor_interval=percentiles(factors),
-        beyond_chance=cautious.above(1.0),
+        beyond_chance=cautious_interval.above(1.0),
     )
 
 
 def _range_mm(
-    fitted: np.ndarray, coded: Sequence[_Coded], effects: Sequence[UnknownEffect]
+    fitted: np.ndarray, coded_unknowns: Sequence[_Coded], effects: Sequence[UnknownEffect]
 ) -> tuple[float, float]:
     """Return the smallest and largest a90 over all levels of the unknowns that move it beyond
     chance."""
     choices = []
-    for of, effect in zip(coded, effects, strict=True):
-        no_shift = np.zeros((1, of.codes.shape[1]))
-        choices.append(of.codes if effect.beyond_chance else no_shift)
-    rows = [np.concatenate([[1.0], *codes]) for codes in product(*choices)]
-    sizes_mm = _a90_mm(fitted, np.array(rows))
+    for coded, effect in zip(coded_unknowns, effects, strict=True):
+        no_shift = np.zeros((1, coded.codes.shape[1]))
+        choices.append(coded.codes if effect.beyond_chance else no_shift)
+    combinations = []
+    for codes in product(*choices):
+        combinations.append(np.concatenate([[1.0], *codes]))
+    sizes_mm = _a90_mm(fitted, np.array(combinations))
     return float(sizes_mm.min()), float(sizes_mm.max())

@@ -36,9 +36,9 @@ def test_every_value_has_its_own_a90_and_its_own_slope(many):
     assert backing.levels == BACKINGS and blur.levels == BLUR_PX
     truth_mm = [true_a90_mm(number) for number in range(3)]
     assert backing.a90_mm == pytest.approx(truth_mm, rel=0.03)
-    assert (backing.least, backing.most) == (0, 1)
+    assert (backing.lowest_level, backing.highest_level) == (0, 1)
     assert backing.factor == pytest.approx(truth_mm[1] / truth_mm[0], rel=0.03)
-    assert (blur.least, blur.most) == (0, 1)
+    assert (blur.lowest_level, blur.highest_level) == (0, 1)
     assert blur.factor == pytest.approx(BLUR_FACTOR, rel=0.03)
     assert blur.a90_mm[1] / blur.a90_mm[0] == pytest.approx(BLUR_FACTOR, rel=0.03)
     assert idle.factor == pytest.approx(1.0, abs=0.03)
@@ -66,7 +66,7 @@ def test_the_sign_of_an_effect_is_that_of_the_range(many):
     turned = replace(blur, level=BLUR_PX[0] + BLUR_PX[1] - blur.level)
     again = over_unknowns(replace(record, drawn=(record.drawn[0], turned)), draws=20)
     by_key = {effect.unknown.key: effect for effect in again.effects}
-    assert (by_key[BLUR].least, by_key[BLUR].most) == (1, 0)
+    assert (by_key[BLUR].lowest_level, by_key[BLUR].highest_level) == (1, 0)
     assert by_key[BLUR].factor == pytest.approx(BLUR_FACTOR, rel=0.03)
 
 
@@ -82,7 +82,7 @@ def test_intervals_cover_the_truth():
             covered[number] += interval.low <= true_a90_mm(number) <= interval.high
         blur = by_key[BLUR]
         interval = blur.factor_interval
-        factor = BLUR_FACTOR if blur.most == 1 else 1 / BLUR_FACTOR
+        factor = BLUR_FACTOR if blur.highest_level == 1 else 1 / BLUR_FACTOR
         covered[3] += interval.low <= factor <= interval.high
         found += by_key[BACKING].beyond_chance
     assert covered.min() >= 31
