@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from harness.evaluation.intervals import percentiles
+from harness.evaluation.study import unknowns
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.unknowns import over_unknowns
 from tests.support.drawn_unknowns import (
@@ -87,6 +89,31 @@ def test_intervals_cover_the_truth():
         found += by_key[BACKING].beyond_chance
     assert covered.min() >= 31
     assert found >= 36
+
+
+def test_intervals_are_stretched_for_the_coefficients_that_the_boards_determine(monkeypatch):
+    """36 boards with 18 coefficients: Student's t of 18 degrees, and half of the variance."""
+    assert unknowns._stretch(36, 18) == pytest.approx(2.10092 / 1.95996 * np.sqrt(2.0), rel=1e-5)
+    record = drawn_set_up()
+    widths = []
+    for stretch in (0.5, 1.0):
+        monkeypatch.setattr(unknowns, "_stretch", lambda boards, coefficients, by=stretch: by)
+        interval = over_unknowns(record, draws=100).effects[0].factor_interval
+        widths.append(np.log(interval.high / interval.low))
+    assert widths[1] / widths[0] == pytest.approx(2.0, rel=0.1)
+
+
+def test_the_confidence_of_what_matters_allows_for_all_pairs_of_values(monkeypatch):
+    """Three backings have three pairs, two ranges one each: 1 - 0.05 / 5."""
+    confidences = []
+
+    def recorded(values, *confidence):
+        confidences.extend(confidence)
+        return percentiles(values, *confidence)
+
+    monkeypatch.setattr(unknowns, "percentiles", recorded)
+    over_unknowns(drawn_set_up(), draws=50)
+    assert confidences == pytest.approx([0.99, 0.99, 0.99])
 
 
 def test_chance_is_seldom_said_to_matter():

@@ -6,13 +6,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from harness.evaluation.summary import summarise_holes
 from harness.experiment.load import load_experiment
 from harness.programs.thesis.answers import THESIS
-from harness.programs.thesis.inference import KIND, SET_UP, borne_out_if, posterior_of
+from harness.programs.thesis.inference import (
+    KIND,
+    SET_UP,
+    _interval,
+    borne_out_if,
+    posterior_of,
+)
 from harness.report.sections import About
 from harness.report.set_ups_page import Layout, set_ups_html
 from tests.support.synthetic_tables import World, joined, provenance, tables
@@ -71,6 +78,16 @@ def test_the_posterior_by_hand(results):
     assert "speaks against nothing" in borne_out_if(certain_of_nothing)
     of_few = table.assign(posterior_high=1.0)
     assert "speaks against nothing" in borne_out_if(of_few)
+
+
+def test_the_interval_of_a_share_holds_for_all_values_jointly():
+    """400 equally likely set-ups, half of which have the value: a binomial share, with the normal
+    quantile of 0.95 for one value and of 1 - 0.05 / 20 for twenty."""
+    has_value = np.arange(400) < 200
+    for values, quantile in ((1, 1.960), (20, 3.023)):
+        interval = _interval(np.ones(400), has_value, values)
+        assert interval.low == pytest.approx(0.5 - quantile * 0.025, abs=0.005)
+        assert interval.high == pytest.approx(0.5 + quantile * 0.025, abs=0.005)
 
 
 def test_a_depth_of_blind_holes_says_nothing_of_through_holes(results):
