@@ -267,6 +267,26 @@ def test_wide_noise_far_below_a_step_is_not_judged_where_rounding_hides_it() -> 
     assert np.median(sides_px[1][:, 4:]) == pytest.approx(12.5, abs=1.5)
 
 
+def test_the_sides_at_the_middle_of_a_part_are_those_of_the_part() -> None:
+    """Two by four parts of a grid of 480 x 960 pixels; half-way between two, their mean."""
+    along_rows = np.array([[9.0, 11.0, 14.0, 18.0], [10.0, 12.0, 15.0, 19.0]], np.float32)
+    blank = np.zeros((480, 960))
+    cloud = Cloud(
+        points_m=np.zeros((480, 960, 3)),
+        reason=blank.astype(np.uint8),
+        count=blank,
+        variance_m2=blank,
+        region=Region(0, 480, 0, 960),
+        z_step_m=0.0,
+        n_frames=5,
+        noise_sides_px=np.stack([along_rows, 2.0 * along_rows]),
+    )
+    assert noise_sides_at(cloud, 119.5, 359.5) == (11.0, 22.0)
+    assert noise_sides_at(cloud, 359.5, 839.5) == (19.0, 38.0)
+    assert noise_sides_at(cloud, 239.5, 479.5) == (13.0, 26.0)
+    assert noise_sides_at(cloud, 0.0, 0.0) == (9.0, 18.0)
+
+
 def test_a_cloud_knows_the_sides_of_upsampled_noise_alone() -> None:
     """A frame that the cloud leaves out does not count."""
     frames = upsampled_frames(0.3, 0.0)

@@ -42,6 +42,45 @@ def test_grooves_are_fitted_and_a_hole_between_them_is_not() -> None:
     assert np.isfinite(rest_m).mean() > 0.95
 
 
+def spread_of(curve_m: np.ndarray, residuals_m: np.ndarray) -> np.ndarray:
+    """The spread (k,) of a profile with knots 1 mm apart, seen along parallel rays by points with
+    residuals (200, k) from it."""
+    rows, columns = np.indices(residuals_m.shape)
+    profile = Profile(
+        along=np.array([0.0, 1.0, 0.0]),
+        across=np.array([1.0, 0.0, 0.0]),
+        ahead=np.array([0.0, 0.0, 1.0]),
+        first=0.0,
+        step=1e-3,
+        curve=curve_m,
+        central=False,
+    )
+    places_m = [1e-3 * columns, 1e-3 * rows, curve_m[columns] + residuals_m]
+    points = np.stack([place_m.ravel() for place_m in places_m], axis=1)
+    return profile.with_spread(points).spread_m
+
+
+def test_scatter_on_a_smooth_curve_is_no_doubt_about_its_place() -> None:
+    """A parabola bends as much over 2 knots as over 6 explains; a step of 3 mm does not."""
+    random = np.random.default_rng(5)
+    knots = np.arange(60)
+    residuals_m = 1e-4 * random.standard_normal((200, 60))
+    residuals_m[:, 28:33] *= 10.0
+    curved_m = 0.8 + 1e-4 * (knots - 30.0) ** 2
+    assert (spread_of(curved_m, residuals_m) == 0.0).all()
+    stepped_m = 0.8 + 3e-3 * (knots >= 30)
+    assert spread_of(stepped_m, residuals_m)[29:32] == pytest.approx([1e-3] * 3, rel=0.25)
+
+
+def test_the_place_beside_a_step_is_uncertain_by_the_step_at_most() -> None:
+    """Residuals of 12 mm beside a step of 3 mm have another cause: the bend of 3 mm counts."""
+    random = np.random.default_rng(6)
+    residuals_m = 1e-4 * random.standard_normal((200, 60))
+    residuals_m[:, 30] += 12e-3
+    stepped_m = 0.8 + 3e-3 * (np.arange(60) >= 30)
+    assert spread_of(stepped_m, residuals_m)[30] == pytest.approx(3e-3, rel=0.15)
+
+
 def test_a_profile_knows_how_little_its_place_is_known_beside_steps() -> None:
     """Three in ten pixels of the strips beside a groove are on its other side, in all bands; a
     dent of 8 mm in two of ten bands does not make its strips uncertain."""
