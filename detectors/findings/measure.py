@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized, wider_blurs
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
@@ -86,15 +86,16 @@ class HoleModelConfig(Config):
 def blur_in_cells(
     cloud: Cloud,
     config: HoleModelConfig,
-    place: tuple[float, float] = (0.0, 0.0),
+    pixel: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[float, float]:
     """Return the sides, along u and along v, of the rectangle over which the cloud is averaged at
-    a place (row, column), in its own pixels or cells: that of a recording's noise, else
+    a ``pixel`` (row, column), in its own pixels or cells: that of a recording's noise, else
     ``config.blur_px``. A map's interpolation between its views' pixels widens it to sqrt(blur^2 +
     2) pixels. Cells larger than a pixel are means themselves."""
     if cloud.map_views is None or not cloud.organised:
-        along_u, along_v = noise_sides_at(cloud, *place)
-        return along_u or float(config.blur_px), along_v or float(config.blur_px)
+        row, column = pixel
+        side_u, side_v = noise_sides_at(cloud, row, column)
+        return side_u or float(config.blur_px), side_v or float(config.blur_px)
     pitch_u, pitch_v = cloud.map_views.pixel_m
     pixel_u = pitch_u / _cell_m(np.diff(cloud.points_m[..., 0], axis=1))
     pixel_v = pitch_v / _cell_m(np.diff(cloud.points_m[..., 1], axis=0))
@@ -325,7 +326,8 @@ def _surroundings(
     around. ``fine``: all pixels instead."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
-    blur_px = blur_in_cells(cloud, config, (float(rows.mean()), float(columns.mean())))
+    middle = (float(rows.mean()), float(columns.mean()))
+    blur_px = blur_in_cells(cloud, config, middle)
     tight = Region(
         int(rows.min()),
         int(rows.max()) + 1,
@@ -397,15 +399,15 @@ def _surroundings(
         sights=_sights(cloud, origin_m, per_px_m, config),
         shared_px=blur_px,
     )
-    normal = normal_of(per_px_m)
     axis = np.array([0.0, 0.0, 1.0])
     ray = axis
     if cloud.projection == "central":
         ray = origin_m / origin_m[2]
-    normal_by_ray = float(abs(normal @ ray) / math.hypot(*normal))
-    normal_share = normal_by_ray
+    # depth along the normal over z along the ray, and over the residual
+    ray_share = _cosine(per_px_m, ray)
+    normal_share = ray_share
     if evidence.residual_along == "axis":
-        normal_share = float(abs(normal @ axis) / math.hypot(*normal))
+        normal_share = _cosine(per_px_m, axis)
     return _Surroundings(
         patch=patch,
         own=own,
@@ -417,13 +419,19 @@ def _surroundings(
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
         normal_share=normal_share,
-        sight_share=normal_share / normal_by_ray * float(np.linalg.norm(ray)),
+        sight_share=normal_share / ray_share * float(np.linalg.norm(ray)),
         u0=u0,
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
         blurs=_blurs_of(cloud),
     )
+
+
+def _cosine(per_px_m: np.ndarray, direction: np.ndarray) -> float:
+    """Return the length of the part of a direction (3,) that is normal to the surface."""
+    normal = normal_of(per_px_m)
+    return float(abs(normal @ direction) / math.hypot(*normal))
 
 
 def _tilt_m(residual_m: np.ndarray, ring: np.ndarray) -> np.ndarray:
@@ -455,7 +463,7 @@ def _blurs_of(cloud: Cloud) -> tuple[tuple[float, bool, float], ...]:
     depth, whose noise is known at each place, those that are no narrower than it, because
     interpolation blurs scene and noise alike; else all, for a recording's is estimated."""
     if cloud.noise_sides_px is not None:
-        return wider_blurs()
+        return tuple(blur for blur in BLURS if blur[0] >= 1.0)
     return BLURS if cloud.noise_reach_px else BLURS[:1]
 
 
