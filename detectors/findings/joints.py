@@ -98,11 +98,11 @@ def joints_of(
         if not free[seed] or not slots.is_long[seed]:
             continue
         parallel = _parallel(slots, seed) & free
-        alike = parallel & _alike(slots, seed)
-        if (alike & slots.is_long).sum() < FEWEST:
+        similar = parallel & _similar(slots, seed)
+        if (similar & slots.is_long).sum() < FEWEST:
             continue
-        on_lattice = parallel & _on_lattice(cloud, evidence, slots, alike)
-        members = on_lattice & alike
+        on_lattice = parallel & _on_lattice(cloud, evidence, slots, similar)
+        members = on_lattice & similar
         members &= ~_departing(slots, members)
         if (members & slots.is_long).sum() < FEWEST:
             continue
@@ -230,7 +230,7 @@ def _parallel(slots: _Slots, seed: int) -> np.ndarray:
     return runs_along & same_side & as_long
 
 
-def _alike(slots: _Slots, seed: int) -> np.ndarray:
+def _similar(slots: _Slots, seed: int) -> np.ndarray:
     """Return which slots (n,) have about the width and depth of a seed. An end has no width."""
     widths = slots.widths_m / slots.widths_m[seed]
     depths = slots.depths_m / slots.depths_m[seed]
@@ -326,33 +326,33 @@ def _on_lattice(
     cloud: Cloud,
     evidence: Evidence,
     slots: _Slots,
-    alike: np.ndarray,
+    similar: np.ndarray,
 ) -> np.ndarray:
-    """Return which slots (n,) the significant moves between ``alike`` slots carry onto one."""
-    alike = alike & slots.is_long
-    first = int(np.flatnonzero(alike)[0])
-    plane = plane_along(slots.along[first], slots.centres_m[alike].mean(axis=0))
+    """Return which slots (n,) the significant moves between ``similar`` slots carry onto one."""
+    similar = similar & slots.is_long
+    first = int(np.flatnonzero(similar)[0])
+    plane = plane_along(slots.along[first], slots.centres_m[similar].mean(axis=0))
     places = slots.centres_m @ plane
-    reach_m = np.full(places.shape, float(np.median(slots.widths_m[alike])))
+    reach_m = np.full(places.shape, float(np.median(slots.widths_m[similar])))
     # the centre of a slot that the rim cuts lies up to half its length from the middle
-    reach_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[alike].max())
+    reach_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[similar].max())
 
     judged = np.isfinite(evidence.residual_m)
     pixel_of = _pixel_map(cloud.points_m[judged] @ plane, judged)
     area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
-    chance = min(float(4.0 * reach_m[alike].prod(axis=1).sum()) / area_m2, 1.0)
-    pairs = _pairs(alike)
+    chance = min(float(4.0 * reach_m[similar].prod(axis=1).sum()) / area_m2, 1.0)
+    pairs = _pairs(similar)
     moves: list[np.ndarray] = []
     for _ in range(MOVES):
         most_hits = 0
         best_move = None
         for start, end in pairs:
             move = places[end] - places[start]
-            linked = _linked(places, reach_m, alike, move)[alike]
+            linked = _linked(places, reach_m, similar, move)[similar]
             hits = int(linked.sum())
             if hits <= most_hits or _is_along(move, moves, float(reach_m[first, 1])):
                 continue
-            is_judged = _are_judged(places[alike] + move, pixel_of, judged)
+            is_judged = _are_judged(places[similar] + move, pixel_of, judged)
             trials = int((is_judged | linked).sum())
             probability = chance_of_following(hits, trials, chance)
             if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
@@ -363,16 +363,16 @@ def _on_lattice(
         moves.append(best_move)
     if len(moves) == 2:
         moves += [moves[0] + moves[1], moves[0] - moves[1]]
-    result = np.zeros(len(alike), bool)
+    result = np.zeros(len(similar), bool)
     for move in moves:
-        result |= _linked(places, reach_m, alike, move)
-        result |= _linked(places, reach_m, alike, -move)
+        result |= _linked(places, reach_m, similar, move)
+        result |= _linked(places, reach_m, similar, -move)
     return result
 
 
-def _pairs(alike: np.ndarray) -> list[tuple[int, int]]:
+def _pairs(similar: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs between which moves are tried: from the strongest of the slots (n,)."""
-    ends = np.flatnonzero(alike).tolist()
+    ends = np.flatnonzero(similar).tolist()
     return [(start, end) for start in ends[:STARTS] for end in ends if start != end]
 
 
@@ -386,11 +386,11 @@ def _is_along(move: np.ndarray, moves: Sequence[np.ndarray], reach_m: float) -> 
 
 
 def _linked(
-    places: np.ndarray, reach_m: np.ndarray, alike: np.ndarray, move: np.ndarray
+    places: np.ndarray, reach_m: np.ndarray, similar: np.ndarray, move: np.ndarray
 ) -> np.ndarray:
-    """Return which places (n, 2) a move (2,) carries near an ``alike`` one (n,)."""
-    off_m = np.abs(places[:, None] + move - places[None, alike])
-    limit_m = np.maximum(reach_m[:, None], reach_m[None, alike])
+    """Return which places (n, 2) a move (2,) carries near a ``similar`` one (n,)."""
+    off_m = np.abs(places[:, None] + move - places[None, similar])
+    limit_m = np.maximum(reach_m[:, None], reach_m[None, similar])
     return np.asarray((off_m <= limit_m).all(axis=2).any(axis=1))
 
 

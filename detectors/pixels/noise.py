@@ -463,11 +463,11 @@ def _end_of_correlation(noise_m: np.ndarray, gains: np.ndarray, total_m2: float)
     width = noise_m.shape[2]
     usable = gains != 0.0
     for lag in range(1, min(FARTHEST_LAG_PX, width)):
-        left = slice(0, width - lag)
-        right = slice(lag, width)
-        pairs = int((usable[:, right] & usable[:, left]).sum())
-        product_m2 = float(np.einsum("kij,kij->", noise_m[..., right], noise_m[..., left]))
-        passed = float(np.einsum("ij,ij->", gains[:, right], gains[:, left]))
+        first = slice(0, width - lag)
+        second = slice(lag, width)
+        pairs = int((usable[:, second] & usable[:, first]).sum())
+        product_m2 = float(np.einsum("kij,kij->", noise_m[..., second], noise_m[..., first]))
+        passed = float(np.einsum("ij,ij->", gains[:, second], gains[:, first]))
         is_judged = passed >= LEAST_PASSED * pairs
         if is_judged and product_m2 < SHARED * total_m2 * passed:
             return float(lag)

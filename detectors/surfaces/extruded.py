@@ -141,8 +141,8 @@ class Profile:
         curve = _filled(curve)
         # on a slope, values beside a knot differ from it by the slope itself
         result = replace(result, curve=curve)
-        rest = group_medians(values - result._curve_at(slopes), knots, count)[0]
-        return replace(result, curve=curve + np.nan_to_num(rest))
+        corrections = group_medians(values - result._curve_at(slopes), knots, count)[0]
+        return replace(result, curve=curve + np.nan_to_num(corrections))
 
     def spread_at(self, points: np.ndarray) -> np.ndarray:
         """Return the deviation (n,) by which the surface may be wrong at points (n, 3), metres."""
@@ -447,24 +447,25 @@ def explains_better(
         inside = band % 2 == parity
         if not inside.any() or inside.all():
             return False
-        other = profile.fitted(points[~inside])
-        errors = np.abs(points[inside, 2] - other(points[inside]))
+        predicting = profile.fitted(points[~inside])
+        errors = np.abs(points[inside, 2] - predicting(points[inside]))
         noise = float(np.nanmedian(errors)) / 0.6745
         limit = CLIP_SIGMAS * noise
         sizes = np.abs(departures[inside])
-        knots = other.knots_of(points)
-        medians, _ = group_medians(departures[~inside], knots[~inside], len(other.curve))
+        knots = predicting.knots_of(points)
+        medians, _ = group_medians(departures[~inside], knots[~inside], len(predicting.curve))
         least_m = max(SEEN * noise, ROUNDED * rounding_m)
         departs = np.abs(np.nan_to_num(medians)) > least_m
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
         gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
     # where the surface is too steep to be judged, no smooth fit is good, and it does not matter
-    known = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
-    counts = np.bincount(band[known], minlength=BANDS)
+    is_judged = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
+    counts = np.bincount(band[is_judged], minlength=BANDS)
     enough = counts >= LEAST_POINTS
     if enough.sum() <= BANDS / 2:
         return False
-    means = np.bincount(band[known], gain[known], minlength=BANDS)[enough] / counts[enough]
+    sums = np.bincount(band[is_judged], gain[is_judged], minlength=BANDS)
+    means = sums[enough] / counts[enough]
     standard_error = float(means.std(ddof=1)) / math.sqrt(len(means))
     return float(means.mean()) > GAIN_SIGMAS * standard_error
 
