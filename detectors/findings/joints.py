@@ -38,7 +38,7 @@ STARTS = 12  # strongest slots from which moves are tried
 TREND_FROM = 12  # slots from which a trend of their sizes is known: four for each coefficient
 SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
-"""Least scatter of widths, depths and areas, as a share of what is usual."""
+"""Least scatter of all that is compared, as a share of what is usual."""
 DEEPEST = 0.95  # quantile of the residuals of a slot's pixels that shows damage within it
 
 
@@ -268,8 +268,8 @@ def _differs(
     errors_m: np.ndarray,
     certain: np.ndarray,
 ) -> np.ndarray:
-    """Return which sizes (n,) differ from the usual ones by more than the ``certain`` ones scatter
-    and than their errors (n,) exceed the usual error."""
+    """Return which sizes (n,) differ from the usual ones by more than `SCATTERS` times both the
+    scatter of the ``certain`` ones and what their own errors (n,) have beyond the usual error."""
     usual_m = _usual(slots, sizes_m, certain)
     scatter_m = _scatter(sizes_m, usual_m, certain)
     usual_error_m = float(np.median(errors_m[certain]))
@@ -279,7 +279,8 @@ def _differs(
 
 
 def _exceeds(slots: _Slots, sizes_m: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Return which sizes (n,) exceed the usual ones by more than the ``certain`` ones scatter."""
+    """Return which sizes (n,) exceed the usual ones by more than `SCATTERS` times the scatter of
+    the ``certain`` ones."""
     usual_m = _usual(slots, sizes_m, certain)
     scatter_m = _scatter(sizes_m, usual_m, certain)
     return np.asarray(sizes_m > usual_m + SCATTERS * scatter_m)
@@ -287,8 +288,8 @@ def _exceeds(slots: _Slots, sizes_m: np.ndarray, certain: np.ndarray) -> np.ndar
 
 def _usual(slots: _Slots, sizes: np.ndarray, certain: np.ndarray) -> np.ndarray:
     """Return the size (n,) that is usual at the place of each slot, from the ``certain`` ones (n,):
-    perspective changes what a camera sees of slots that are alike steadily across its picture. If
-    fewer than `TREND_FROM` are certain, it is the same everywhere."""
+    what a camera sees of slots that are alike changes steadily across its picture. If fewer than
+    `TREND_FROM` are certain, it is the same everywhere."""
     if certain.sum() < TREND_FROM:
         return np.full(len(sizes), float(np.median(sizes[certain])))
     points = np.column_stack([slots.centres_m[:, :2], sizes])
