@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from detectors.findings.joints import Joints
+from detectors.findings.joints import Joints, plane_along
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
 from harness.vocabulary.geometry import Cloud
@@ -43,69 +43,78 @@ def damage_beside(
     """Return the damage that the differing joints of a feature touch."""
     points_m = cloud.points_m.reshape(-1, 3)
     strongest = feature.members[0]
-    along = measurements[strongest].along
-    across = np.cross(along, detections[strongest].centre_m)
-    plane = np.column_stack([along, across / np.linalg.norm(across)])
+    plane = plane_along(measurements[strongest].along, detections[strongest].centre_m)
     half_m = np.zeros(2)
     for number in feature.members:
         places_m = points_m[detections[number].pixels] @ plane
         middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
         half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))
-    beside = []
+    touching = []
     for number in feature.differing:
-        detection = detections[number]
-        places_m = points_m[detection.pixels] @ plane
-        off_m = places_m - _middle(places_m, half_m)
-        outside = (np.abs(off_m) > half_m).any(axis=1)
-        pixels = _largest(cloud, detection.pixels[outside])
+        joint = detections[number]
+        places_m = points_m[joint.pixels] @ plane
+        offsets_m = places_m - _middle(places_m, half_m)
+        is_outside = (np.abs(offsets_m) > half_m).any(axis=1)
+        pixels = _largest_part(cloud, joint.pixels[is_outside])
         if len(pixels) < FEWEST_OUTSIDE:
             continue
-        joint = np.zeros(cloud.valid.shape, bool)
-        joint.reshape(-1)[detection.pixels] = True
-        joint = grown(joint, MARGIN_PX)
-        joint.reshape(-1)[pixels] = False
-        part = replace(
-            detection,
+        damage = replace(
+            joint,
             score=float(evidence.score.reshape(-1)[pixels].max()),
             pixels=pixels,
             centre_m=points_m[pixels].mean(axis=0),
         )
-        without = replace(evidence, residual_m=np.where(joint, np.nan, evidence.residual_m))
-        beside.append(TouchingDamage(number, part, without))
-    return tuple(beside)
+        without_joint = _without_joint(evidence, joint, damage)
+        touching.append(TouchingDamage(number, damage, without_joint))
+    return tuple(touching)
 
 
-def without_damage(feature: Joints, beside: Sequence[TouchingDamage]) -> Joints:
+def without_damage(feature: Joints, touching: Sequence[TouchingDamage]) -> Joints:
     """Return the feature, of which the joints that damage touches are members: without it they do
     not differ."""
-    touched = tuple(part.joint for part in beside if part.joint in feature.differing)
-    differing = tuple(number for number in feature.differing if number not in touched)
+    numbers = {damage.joint for damage in touching}
+    touched = tuple(number for number in feature.differing if number in numbers)
+    differing = tuple(number for number in feature.differing if number not in numbers)
     return Joints(feature.members + touched, differing)
 
 
 def _middle(places_m: np.ndarray, half_m: np.ndarray) -> np.ndarray:
     """Return the middle (2,) of a joint among places (n, 2) that damage widens: along each axis,
-    that of the extent of a joint that holds the most places."""
+    that of the extent of a joint that holds the most places. ``half_m`` (2,): half that extent."""
     middle_m = np.zeros(2)
     for axis in (0, 1):
         ordered_m = np.sort(places_m[:, axis])
         ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m[axis], side="right")
-        first = int((ends - np.arange(len(ordered_m))).argmax())
+        counts = ends - np.arange(len(ordered_m))
+        first = int(counts.argmax())
         last = int(ends[first]) - 1
         middle_m[axis] = 0.5 * (ordered_m[first] + ordered_m[last])
     return middle_m
 
 
-def _largest(cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
-    """Return the largest connected part of pixels (n,), and those within its own extent of it: a
-    joint parts damage that it crosses."""
+def _without_joint(evidence: Evidence, joint: Detection, damage: Detection) -> Evidence:
+    """Return the evidence in which the pixels of a joint and its margin are not judged, but those
+    of the damage are."""
+    cut_out = np.zeros(evidence.residual_m.shape, bool)
+    cut_out.reshape(-1)[joint.pixels] = True
+    cut_out = grown(cut_out, MARGIN_PX)
+    cut_out.reshape(-1)[damage.pixels] = False
+    return replace(evidence, residual_m=np.where(cut_out, np.nan, evidence.residual_m))
+
+
+def _largest_part(cloud: Cloud, pixels: np.ndarray) -> np.ndarray:
+    """Return the largest connected part of pixels (n,), and the parts whose centres lie within
+    twice its extent of its own: a joint parts damage that it crosses."""
     mask = np.zeros(cloud.valid.shape, np.uint8)
     mask.reshape(-1)[pixels] = 1
     _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if len(stats) < 2:
         return pixels[:0]
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    extent_px = float(max(stats[largest, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1]))
-    near = np.hypot(*(centres - centres[largest]).T) <= 2.0 * extent_px
-    near[0] = False
-    return pixels[near[labels.reshape(-1)[pixels]]]
+    extent_px = float(max(stats[largest, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]))
+    offsets_px = centres - centres[largest]
+    distances_px = np.hypot(offsets_px[:, 0], offsets_px[:, 1])
+    belongs = distances_px <= 2.0 * extent_px
+    belongs[0] = False  # the background
+    label_of_pixel = labels.reshape(-1)[pixels]
+    return pixels[belongs[label_of_pixel]]

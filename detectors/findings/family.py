@@ -47,11 +47,6 @@ DEPTH_ERROR = 0.08
 walls lengthens its way."""
 
 
-def wider_blurs() -> tuple[tuple[float, bool, float], ...]:
-    """Return the `BLURS` that are at least as wide as that of the noise."""
-    return tuple(blur for blur in BLURS if blur[0] >= 1.0)
-
-
 @dataclass(frozen=True)
 class Start:
     """Start values of a fit."""

@@ -38,7 +38,7 @@ STARTS = 12  # strongest slots from which moves are tried
 TREND_FROM = 12  # slots from which a trend of their sizes is known: four for each coefficient
 SCATTERS = 4.0  # of the others, by which a slot departs that is no longer alike
 LEAST_SCATTER = 0.03
-"""Least scatter of widths, depths and areas, as a share of what is usual."""
+"""Least scatter of all that is compared, as a share of what is usual."""
 DEEPEST = 0.95  # quantile of the residuals of a slot's pixels that shows damage within it
 
 
@@ -76,7 +76,7 @@ class _Slots:
     """(n,): size of the residual at the quantile `DEEPEST` of the pixels."""
     cut: np.ndarray
     """(n,) bool: reaches the rim of the judged area, so that its length is not known."""
-    whole: np.ndarray
+    is_long: np.ndarray
     """(n,) bool: is long; else it may be the end of a slot that the rim cuts."""
 
 
@@ -90,21 +90,21 @@ def joints_of(
     none without a pixel grid."""
     if not cloud.organised:
         return ()
-    found = _slots(evidence, detections, measurements)
-    free = np.ones(len(found.numbers), bool)
+    candidates = _slots(evidence, detections, measurements)
+    free = np.ones(len(candidates.numbers), bool)
     features = []
-    for seed in range(len(found.numbers)):
-        slots = _with_ends(found, seed)
-        if not free[seed] or not slots.whole[seed]:
+    for seed in range(len(candidates.numbers)):
+        slots = _with_ends(candidates, seed)
+        if not free[seed] or not slots.is_long[seed]:
             continue
         parallel = _parallel(slots, seed) & free
-        alike = parallel & _alike(slots, seed)
-        if (alike & slots.whole).sum() < FEWEST:
+        similar = parallel & _similar(slots, seed)
+        if (similar & slots.is_long).sum() < FEWEST:
             continue
-        on_lattice = parallel & _on_lattice(cloud, evidence, slots, alike)
-        members = on_lattice & alike
+        on_lattice = parallel & _on_lattice(cloud, evidence, slots, similar)
+        members = on_lattice & similar
         members &= ~_departing(slots, members)
-        if (members & slots.whole).sum() < FEWEST:
+        if (members & slots.is_long).sum() < FEWEST:
             continue
         free &= ~on_lattice
         differing = tuple(slots.numbers[on_lattice & ~members].tolist())
@@ -164,7 +164,8 @@ def _slots(
     reach the rim."""
     rim = _rim(evidence).ravel()
     numbers = []
-    whole = []
+    long = []
+    cut = []
     for number, (detection, measured) in enumerate(zip(detections, measurements, strict=True)):
         sizes = (measured.length_m, measured.width_m, measured.normal_depth_m)
         is_known = all(math.isfinite(size) for size in sizes)
@@ -172,7 +173,8 @@ def _slots(
         is_cut = bool(rim[detection.pixels].any())
         if detection.kind == "depth" and is_known and (is_long or is_cut):
             numbers.append(number)
-            whole.append(is_long)
+            long.append(is_long)
+            cut.append(is_cut)
     chosen = [measurements[number] for number in numbers]
     sizes_m = np.abs(np.nan_to_num(evidence.residual_m)).ravel()
     deepest_m = [np.quantile(sizes_m[detections[number].pixels], DEEPEST) for number in numbers]
@@ -191,8 +193,8 @@ def _slots(
         areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
         errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
         deepest_m=np.array(deepest_m),
-        cut=np.array([bool(rim[detections[number].pixels].any()) for number in numbers], bool),
-        whole=np.array(whole, bool),
+        cut=np.array(cut, bool),
+        is_long=np.array(long, bool),
     )
 
 
@@ -210,30 +212,31 @@ def _rim(evidence: Evidence) -> np.ndarray:
 
 def _with_ends(slots: _Slots, seed: int) -> _Slots:
     """Return the slots, of which those at the rim that are less than `LONG` times as long as a seed
-    is wide are no whole ones: the rim leaves the end of a slot, of any direction and width."""
+    is wide do not count as long: the rim leaves the end of a slot, of any direction and width."""
     is_end = slots.cut & (slots.lengths_m < LONG * slots.widths_m[seed])
-    return replace(slots, whole=slots.whole & ~is_end)
+    return replace(slots, is_long=slots.is_long & ~is_end)
 
 
 def _parallel(slots: _Slots, seed: int) -> np.ndarray:
     """Return which slots (n,) run along a seed, as far as their widths let one tell, and are on the
     same side of the surface, and about as long or cut by the rim. An end has no direction."""
     cosines = np.abs(slots.along @ slots.along[seed])
-    angles = np.arctan2(slots.widths_m, slots.lengths_m)
+    angles_rad = np.arctan2(slots.widths_m, slots.lengths_m)
+    limits_rad = np.maximum(angles_rad, angles_rad[seed])
     same_side = np.sign(slots.depths_m) == np.sign(slots.depths_m[seed])
     ratio = slots.lengths_m / slots.lengths_m[seed]
     as_long = (ratio < ALIKE) & ((ratio > 1.0 / ALIKE) | slots.cut)
-    runs_along = (cosines >= np.cos(np.maximum(angles, angles[seed]))) | ~slots.whole
+    runs_along = (cosines >= np.cos(limits_rad)) | ~slots.is_long
     return runs_along & same_side & as_long
 
 
-def _alike(slots: _Slots, seed: int) -> np.ndarray:
+def _similar(slots: _Slots, seed: int) -> np.ndarray:
     """Return which slots (n,) have about the width and depth of a seed. An end has no width."""
     widths = slots.widths_m / slots.widths_m[seed]
     depths = slots.depths_m / slots.depths_m[seed]
     as_wide = (widths < ALIKE) & (widths > 1.0 / ALIKE)
     as_deep = (depths < ALIKE) & (depths > 1.0 / ALIKE)
-    return (as_wide | ~slots.whole) & as_deep
+    return (as_wide | ~slots.is_long) & as_deep
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
@@ -241,48 +244,61 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
     place by more than these scatter and than what is less certain about them, as about a slot that
     the rim cuts. An end has no width."""
     result = np.zeros(len(slots.numbers), bool)
-    certain = members & slots.whole
+    certain = members & slots.is_long
     if not certain.any():
         return result
-    departures = []
-    for column, sizes_m in enumerate((slots.widths_m, slots.depths_m)):
-        errors_m = slots.errors[:, column]
-        usual_m = _usual(slots, sizes_m, certain)
-        usual_error_m = float(np.median(errors_m[certain]))
-        further_m = np.sqrt(np.maximum(errors_m**2 - usual_error_m**2, 0.0))
-        scatter_m = _scatter(sizes_m, usual_m, certain)
-        departures.append(np.abs(sizes_m - usual_m) > SCATTERS * np.hypot(scatter_m, further_m))
-    result |= departures[0] & slots.whole
-    result |= departures[1]
+    width_errors_m = slots.errors[:, 0]
+    depth_errors_m = slots.errors[:, 1]
+    result |= _differs(slots, slots.widths_m, width_errors_m, certain) & slots.is_long
+    result |= _differs(slots, slots.depths_m, depth_errors_m, certain)
     # damage that touches a joint is found with it: it shows in the area, or deepens a part of it
     usual_m2 = _usual(slots, slots.areas_m2, certain)
     scatter_m2 = _scatter(slots.areas_m2, usual_m2, certain)
     result |= slots.areas_m2 > usual_m2 + SCATTERS * scatter_m2
+    result |= _exceeds(slots, slots.deepest_m, certain)
     # less of it leaves an error that no slot explains; alone, that is a fit that was not determined
-    unexplained_m = slots.errors[:, 0]
-    usual_m = _usual(slots, unexplained_m, certain)
-    limit_m = usual_m + SCATTERS * _scatter(unexplained_m, usual_m, certain)
     is_larger = slots.areas_m2 > usual_m2 + scatter_m2
-    result |= ~slots.cut & is_larger & (unexplained_m > limit_m)
-    usual_m = _usual(slots, slots.deepest_m, certain)
-    scatter_m = _scatter(slots.deepest_m, usual_m, certain)
-    result |= slots.deepest_m > usual_m + SCATTERS * scatter_m
+    result |= ~slots.cut & is_larger & _exceeds(slots, width_errors_m, certain)
     return result
 
 
+def _differs(
+    slots: _Slots,
+    sizes_m: np.ndarray,
+    errors_m: np.ndarray,
+    certain: np.ndarray,
+) -> np.ndarray:
+    """Return which sizes (n,) differ from the usual ones by more than `SCATTERS` times both the
+    scatter of the ``certain`` ones and what their own errors (n,) have beyond the usual error."""
+    usual_m = _usual(slots, sizes_m, certain)
+    scatter_m = _scatter(sizes_m, usual_m, certain)
+    usual_error_m = float(np.median(errors_m[certain]))
+    excess_m = np.sqrt(np.maximum(errors_m**2 - usual_error_m**2, 0.0))
+    limit_m = SCATTERS * np.hypot(scatter_m, excess_m)
+    return np.asarray(np.abs(sizes_m - usual_m) > limit_m)
+
+
+def _exceeds(slots: _Slots, sizes_m: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Return which sizes (n,) exceed the usual ones by more than `SCATTERS` times the scatter of
+    the ``certain`` ones."""
+    usual_m = _usual(slots, sizes_m, certain)
+    scatter_m = _scatter(sizes_m, usual_m, certain)
+    return np.asarray(sizes_m > usual_m + SCATTERS * scatter_m)
+
+
 def _usual(slots: _Slots, sizes: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Return what size (n,) is usual at the place of each slot, from the ``certain`` ones (n,):
-    perspective changes steadily across a picture what is seen of slots that are alike. It is the
-    same everywhere where fewer than `TREND_FROM` are certain."""
+    """Return the size (n,) that is usual at the place of each slot, from the ``certain`` ones (n,):
+    what a camera sees of slots that are alike changes steadily across its picture. If fewer than
+    `TREND_FROM` are certain, it is the same everywhere."""
     if certain.sum() < TREND_FROM:
         return np.full(len(sizes), float(np.median(sizes[certain])))
     points = np.column_stack([slots.centres_m[:, :2], sizes])
     weights = certain.astype(float)
     for _ in range(3):
         usual = np.asarray(polynomial(points, weights, degree=1)(points))
-        off = sizes - usual
-        scatter = max(float(np.median(np.abs(off[certain]))) / 0.6745, 1e-9)
-        weights = certain * bisquare_weights(off, BISQUARE_TUNING * scatter)
+        residuals = sizes - usual
+        scatter = max(float(np.median(np.abs(residuals[certain]))) / 0.6745, 1e-9)
+        weights = certain * bisquare_weights(residuals, BISQUARE_TUNING * scatter)
     return usual
 
 
@@ -294,83 +310,88 @@ def _scatter(sizes: np.ndarray, usual: np.ndarray, certain: np.ndarray) -> np.nd
 
 
 def chance_of_following(hits: int, trials: int, chance: float) -> float:
-    """Return the probability that so many slots or more hold a slot where a move leads, of
-    ``trials`` places of which each holds one by ``chance``. The first pair gives the move and
-    proves nothing, so it is left out of both numbers."""
+    """Return the probability that a move leads to ``hits`` slots or more in as many ``trials``, if
+    a slot lies at the end of each with the probability ``chance``. The first pair gives the move
+    and proves nothing, so it is left out of both numbers."""
     return float(special.bdtrc(hits - 2, trials - 1, chance))
+
+
+def plane_along(along: np.ndarray, sight_m: np.ndarray) -> np.ndarray:
+    """Return two directions (3, 2) in which places on a surface are counted: ``along`` a slot, and
+    across it and the line of sight (3,)."""
+    across = np.cross(along, sight_m)
+    return np.column_stack([along, across / np.linalg.norm(across)])
 
 
 def _on_lattice(
     cloud: Cloud,
     evidence: Evidence,
     slots: _Slots,
-    alike: np.ndarray,
+    similar: np.ndarray,
 ) -> np.ndarray:
-    """Return which slots (n,) the significant moves between ``alike`` slots carry onto one."""
-    alike = alike & slots.whole
-    first = int(np.flatnonzero(alike)[0])
-    along = slots.along[first]
-    across = np.cross(along, slots.centres_m[alike].mean(axis=0))
-    plane = np.column_stack([along, across / np.linalg.norm(across)])
+    """Return which slots (n,) the significant moves between ``similar`` slots carry onto one."""
+    similar = similar & slots.is_long
+    first = int(np.flatnonzero(similar)[0])
+    plane = plane_along(slots.along[first], slots.centres_m[similar].mean(axis=0))
     places = slots.centres_m @ plane
-    near_m = np.full(places.shape, float(np.median(slots.widths_m[alike])))
+    reach_m = np.full(places.shape, float(np.median(slots.widths_m[similar])))
     # the centre of a slot that the rim cuts lies up to half its length from the middle
-    near_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[alike].max())
+    reach_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[similar].max())
 
     judged = np.isfinite(evidence.residual_m)
     pixel_of = _pixel_map(cloud.points_m[judged] @ plane, judged)
     area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
-    chance = min(float(4.0 * near_m[alike].prod(axis=1).sum()) / area_m2, 1.0)
-    pairs = _pairs(alike)
+    chance = min(float(4.0 * reach_m[similar].prod(axis=1).sum()) / area_m2, 1.0)
+    pairs = _pairs(similar)
     moves: list[np.ndarray] = []
     for _ in range(MOVES):
-        most = 0
-        best = None
+        most_hits = 0
+        best_move = None
         for start, end in pairs:
             move = places[end] - places[start]
-            linked = _linked(places, near_m, alike, move)[alike]
+            linked = _linked(places, reach_m, similar, move)[similar]
             hits = int(linked.sum())
-            if hits <= most or _is_along(move, moves, float(near_m[first, 1])):
+            if hits <= most_hits or _is_along(move, moves, float(reach_m[first, 1])):
                 continue
-            seen = _seen(places[alike] + move, pixel_of, judged)
-            trials = int((seen | linked).sum())
+            is_judged = _are_judged(places[similar] + move, pixel_of, judged)
+            trials = int((is_judged | linked).sum())
             probability = chance_of_following(hits, trials, chance)
             if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
-                most = hits
-                best = move
-        if best is None:
+                most_hits = hits
+                best_move = move
+        if best_move is None:
             break
-        moves.append(best)
+        moves.append(best_move)
     if len(moves) == 2:
         moves += [moves[0] + moves[1], moves[0] - moves[1]]
-    result = np.zeros(len(alike), bool)
+    result = np.zeros(len(similar), bool)
     for move in moves:
-        result |= _linked(places, near_m, alike, move)
-        result |= _linked(places, near_m, alike, -move)
+        result |= _linked(places, reach_m, similar, move)
+        result |= _linked(places, reach_m, similar, -move)
     return result
 
 
-def _pairs(alike: np.ndarray) -> list[tuple[int, int]]:
+def _pairs(similar: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs between which moves are tried: from the strongest of the slots (n,)."""
-    ends = np.flatnonzero(alike).tolist()
+    ends = np.flatnonzero(similar).tolist()
     return [(start, end) for start in ends[:STARTS] for end in ends if start != end]
 
 
-def _is_along(move: np.ndarray, moves: Sequence[np.ndarray], near_m: float) -> bool:
-    """Return whether a move runs along one that is already known."""
-    for known in moves:
-        off_m = abs(float(move[0] * known[1] - move[1] * known[0])) / float(np.linalg.norm(known))
-        if off_m <= near_m:
+def _is_along(move: np.ndarray, moves: Sequence[np.ndarray], reach_m: float) -> bool:
+    """Return whether a move runs along one of the ``moves``, to ``reach_m`` across it."""
+    for earlier in moves:
+        area_m2 = abs(float(move[0] * earlier[1] - move[1] * earlier[0]))
+        if area_m2 / float(np.linalg.norm(earlier)) <= reach_m:
             return True
     return False
 
 
 def _linked(
-    places: np.ndarray, near_m: np.ndarray, alike: np.ndarray, move: np.ndarray
+    places: np.ndarray, reach_m: np.ndarray, similar: np.ndarray, move: np.ndarray
 ) -> np.ndarray:
-    """Return which places (n, 2) a move (2,) carries near an ``alike`` one (n,)."""
-    off_m = np.abs(places[:, None] + move - places[None, alike])
-    limit_m = np.maximum(near_m[:, None], near_m[None, alike])
+    """Return which places (n, 2) a move (2,) carries near a ``similar`` one (n,)."""
+    off_m = np.abs(places[:, None] + move - places[None, similar])
+    limit_m = np.maximum(reach_m[:, None], reach_m[None, similar])
     return np.asarray((off_m <= limit_m).all(axis=2).any(axis=1))
 
 
@@ -382,7 +403,7 @@ def _pixel_map(places: np.ndarray, judged: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(design, np.column_stack([columns, rows]), rcond=None)[0]
 
 
-def _seen(places: np.ndarray, pixel_of: np.ndarray, judged: np.ndarray) -> np.ndarray:
+def _are_judged(places: np.ndarray, pixel_of: np.ndarray, judged: np.ndarray) -> np.ndarray:
     """Return which places (n, 2) are judged."""
     pixels = np.rint(places @ pixel_of[:2] + pixel_of[2]).astype(int)
     inside = ((pixels >= 0) & (pixels < judged.shape[::-1])).all(axis=1)

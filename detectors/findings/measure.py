@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized, wider_blurs
+from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     normal_of,
@@ -86,15 +86,16 @@ class HoleModelConfig(Config):
 def blur_in_cells(
     cloud: Cloud,
     config: HoleModelConfig,
-    place: tuple[float, float] = (0.0, 0.0),
+    pixel: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[float, float]:
     """Return the sides, along u and along v, of the rectangle over which the cloud is averaged at
-    a place (row, column), in its own pixels or cells: that of a recording's noise, else
+    a ``pixel`` (row, column), in its own pixels or cells: that of a recording's noise, else
     ``config.blur_px``. A map's interpolation between its views' pixels widens it to sqrt(blur^2 +
     2) pixels. Cells larger than a pixel are means themselves."""
     if cloud.map_views is None or not cloud.organised:
-        along_u, along_v = noise_sides_at(cloud, *place)
-        return along_u or float(config.blur_px), along_v or float(config.blur_px)
+        row, column = pixel
+        side_u, side_v = noise_sides_at(cloud, row, column)
+        return side_u or float(config.blur_px), side_v or float(config.blur_px)
     pitch_u, pitch_v = cloud.map_views.pixel_m
     pixel_u = pitch_u / _cell_m(np.diff(cloud.points_m[..., 0], axis=1))
     pixel_v = pitch_v / _cell_m(np.diff(cloud.points_m[..., 1], axis=0))
@@ -198,11 +199,11 @@ def measure_detection(
     around = _surroundings(cloud, evidence, detection, config)
     if around is None:
         return measured
-    near = around.near & around.patch.used
-    length_m, width_m, along = _sides(around, near)
+    pixels = around.widened & around.patch.used
+    length_m, width_m, along = _sides(around, pixels)
     measured = replace(
         measured,
-        volume_m3=_volume(around, near),
+        volume_m3=_volume(around, pixels),
         length_m=length_m,
         width_m=width_m,
         along=along,
@@ -252,9 +253,9 @@ class _Surroundings:
     """A detection and its neighbourhood, a patch of h x w pixels."""
 
     patch: HolePatch
-    own: np.ndarray
+    detected: np.ndarray
     """(h, w) bool: the detection's pixels."""
-    near: np.ndarray
+    widened: np.ndarray
     """(h, w) bool: these grown by one more than ``reach_px``."""
     binned: int
     """Side of the squares of the cloud's pixels whose means are the patch's pixels."""
@@ -325,7 +326,8 @@ def _surroundings(
     around. ``fine``: all pixels instead."""
     h, w = cloud.points_m.shape[:2]
     rows, columns = np.unravel_index(detection.pixels, (h, w))
-    blur_px = blur_in_cells(cloud, config, (float(rows.mean()), float(columns.mean())))
+    middle = (float(rows.mean()), float(columns.mean()))
+    blur_px = blur_in_cells(cloud, config, middle)
     tight = Region(
         int(rows.min()),
         int(rows.max()) + 1,
@@ -338,19 +340,19 @@ def _surroundings(
     cut = corner.within(Region(0, h, 0, w))
     residual_m = evidence.residual_m[cut]
     points_m = cloud.points_m[cut]
-    own = np.zeros(residual_m.shape, dtype=bool)
-    own[rows - corner.row0, columns - corner.col0] = True
+    detected = np.zeros(residual_m.shape, dtype=bool)
+    detected[rows - corner.row0, columns - corner.col0] = True
     plane = local_plane(
         points_m,
         evidence.surface_z_m[cut],
         np.isfinite(residual_m),
-        own,
+        detected,
         cloud.projection,
     )
     if plane is None:
         return None
     origin_m, per_px_m = plane
-    u0, v0 = _centroid(own)
+    u0, v0 = _centroid(detected)
     binned = 1
     if not fine:
         # several pixels across the detection: a slot is long, but narrow
@@ -362,8 +364,8 @@ def _surroundings(
     invalid = ~np.isfinite(points_m[..., 2])
     if binned > 1:
         residual_m = _means(residual_m, binned)
-        coverage = _means(own.astype(float), binned)
-        own = coverage >= min(0.5, coverage.max())
+        coverage = _means(detected.astype(float), binned)
+        detected = coverage >= min(0.5, coverage.max())
         invalid = _means(invalid.astype(float), binned) > 0.5
         per_px_m = binned * per_px_m
         u0 = (u0 + 0.5) / binned - 0.5
@@ -372,8 +374,8 @@ def _surroundings(
         blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
-    near = grown(own, reach_px + 1)
-    ring = finite & ~near
+    widened = grown(detected, reach_px + 1)
+    ring = finite & ~widened
     if ring.sum() < FEWEST_AROUND:
         return None
     if cloud.noise_sides_px is not None:
@@ -383,10 +385,10 @@ def _surroundings(
     noise_m = sigma_of(ring_m - offset_m)
     # large residuals that do not touch the detection are other damage; the blur spreads it
     limit_m = OTHER_DAMAGE_SIGMAS * max(noise_m, 1e-9)
-    stands_out = (np.abs(residual_m - offset_m) > limit_m) | own
-    other_damage = stands_out & ~parts_with(stands_out, own)
-    used = finite & (own | ~grown(other_damage, reach_px))
-    deviations_m = residual_m[own & finite] - offset_m
+    stands_out = (np.abs(residual_m - offset_m) > limit_m) | detected
+    other_damage = stands_out & ~parts_with(stands_out, detected)
+    used = finite & (detected | ~grown(other_damage, reach_px))
+    deviations_m = residual_m[detected & finite] - offset_m
     sign = 1.0 if deviations_m.sum() >= 0 else -1.0
     patch = HolePatch(
         residual_m=residual_m,
@@ -397,19 +399,19 @@ def _surroundings(
         sights=_sights(cloud, origin_m, per_px_m, config),
         shared_px=blur_px,
     )
-    normal = normal_of(per_px_m)
     axis = np.array([0.0, 0.0, 1.0])
     ray = axis
     if cloud.projection == "central":
         ray = origin_m / origin_m[2]
-    normal_by_ray = float(abs(normal @ ray) / math.hypot(*normal))
-    normal_share = normal_by_ray
+    # depth along the normal over z along the ray, and over the residual
+    ray_share = _cosine(per_px_m, ray)
+    normal_share = ray_share
     if evidence.residual_along == "axis":
-        normal_share = float(abs(normal @ axis) / math.hypot(*normal))
+        normal_share = _cosine(per_px_m, axis)
     return _Surroundings(
         patch=patch,
-        own=own,
-        near=near,
+        detected=detected,
+        widened=widened,
         binned=binned,
         invalid=invalid,
         offset_m=offset_m,
@@ -417,13 +419,19 @@ def _surroundings(
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
         normal_share=normal_share,
-        sight_share=normal_share / normal_by_ray * float(np.linalg.norm(ray)),
+        sight_share=normal_share / ray_share * float(np.linalg.norm(ray)),
         u0=u0,
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
         blurs=_blurs_of(cloud),
     )
+
+
+def _cosine(per_px_m: np.ndarray, direction: np.ndarray) -> float:
+    """Return the length of the part of a direction (3,) that is normal to the surface."""
+    normal = normal_of(per_px_m)
+    return float(abs(normal @ direction) / math.hypot(*normal))
 
 
 def _tilt_m(residual_m: np.ndarray, ring: np.ndarray) -> np.ndarray:
@@ -455,7 +463,7 @@ def _blurs_of(cloud: Cloud) -> tuple[tuple[float, bool, float], ...]:
     depth, whose noise is known at each place, those that are no narrower than it, because
     interpolation blurs scene and noise alike; else all, for a recording's is estimated."""
     if cloud.noise_sides_px is not None:
-        return wider_blurs()
+        return tuple(blur for blur in BLURS if blur[0] >= 1.0)
     return BLURS if cloud.noise_reach_px else BLURS[:1]
 
 
@@ -508,7 +516,7 @@ def local_plane(
     points: np.ndarray,
     surface_z: np.ndarray,
     finite: np.ndarray,
-    own: np.ndarray,
+    detected: np.ndarray,
     projection: str,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the surface's point at the detection's centroid (3,) and its derivatives by u and v
@@ -519,9 +527,9 @@ def local_plane(
         points: (h, w, 3), metres, of a patch.
         surface_z: (h, w), metres, of the fitted surface.
         finite: (h, w) bool, the pixels to use.
-        own: (h, w) bool, the detection's pixels.
+        detected: (h, w) bool, the detection's pixels.
         projection: "central" or "parallel"."""
-    u0, v0 = _centroid(own)
+    u0, v0 = _centroid(detected)
     x, y, z = points[finite].T
     rows, columns = np.nonzero(finite)
     scale = 1.0 if projection == "parallel" else z
@@ -545,21 +553,22 @@ def local_plane(
     return centre, per_px
 
 
-def _volume(around: _Surroundings, near: np.ndarray) -> float:
-    """Return the volume in m3 between the surface and the pixels ``near`` (h, w) bool, positive
+def _volume(around: _Surroundings, pixels: np.ndarray) -> float:
+    """Return the volume in m3 between the surface and the ``pixels`` (h, w) bool, positive
     behind the surface."""
-    depth_m = float((around.patch.residual_m[near] - around.offset_m).sum())
+    depth_m = float((around.patch.residual_m[pixels] - around.offset_m).sum())
     (ax, ay, _), (bx, by, _) = around.per_px_m
     # the area of a pixel perpendicular to the optical axis
     return depth_m * float(abs(ax * by - ay * bx))
 
 
-def _sides(around: _Surroundings, near: np.ndarray) -> tuple[float, float, np.ndarray]:
+def _sides(around: _Surroundings, pixels: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Return length, width and direction (3,) of the length of the rectangle on the surface that
-    has the second moments of the residual within ``near`` (h, w) bool, minus those of the blur."""
-    residual_m = around.patch.residual_m[near] - around.offset_m
+    has the second moments of the residual within the ``pixels`` (h, w) bool, minus those of the
+    blur."""
+    residual_m = around.patch.residual_m[pixels] - around.offset_m
     weight = np.maximum(around.sign * residual_m, 0.0)
-    rows, columns = np.nonzero(near)
+    rows, columns = np.nonzero(pixels)
     if not weight.sum() > 0:
         return np.nan, np.nan, np.full(3, np.nan)
     weight = weight / weight.sum()
@@ -583,13 +592,13 @@ def _modelled(
     config: HoleModelConfig,
 ) -> tuple[Size | None, str]:
     """Return the fitted hole, or None and the reason why the model does not hold."""
-    own = around.own
+    detected = around.detected
     invalid = around.invalid
     too_deep = (
         f"deeper than {config.linear_depth_mm:g} mm, where the camera's filter no longer averages"
         " evenly"
     )
-    inside = own | (invalid & grown(own, 1))
+    inside = detected | (invalid & grown(detected, 1))
     if float((invalid & inside).sum()) > config.largest_invalid * float(inside.sum()):
         return None, DARK
     if around.peak_m > config.linear_depth_mm * MM:
@@ -629,11 +638,11 @@ def _sized(around: _Surroundings) -> Size | None:
 def _start(around: _Surroundings) -> Start:
     """Return start values: the centroid of the deviation, the radius that gives its volume, its
     peak, and the sides and the direction of its second moments."""
-    near = grown(around.own, around.reach_px) & around.patch.used
-    weight = np.maximum(around.sign * (around.patch.residual_m[near] - around.offset_m), 0.0)
-    rows, columns = np.nonzero(near)
+    pixels = grown(around.detected, around.reach_px) & around.patch.used
+    weight = np.maximum(around.sign * (around.patch.residual_m[pixels] - around.offset_m), 0.0)
+    rows, columns = np.nonzero(pixels)
     total = max(float(weight.sum()), 1e-12)
-    length_m, width_m, along = _sides(around, around.near & around.patch.used)
+    length_m, width_m, along = _sides(around, around.widened & around.patch.used)
     stretch = 0.0
     angle_rad = 0.0
     if width_m > 0.0:
@@ -654,12 +663,12 @@ def _start(around: _Surroundings) -> Start:
 def _explains(around: _Surroundings, size: Size) -> bool:
     """Return whether the best shape lies near the detection and explains its residual."""
     fit = size.best
-    h, w = around.own.shape
+    h, w = around.detected.shape
     row = round(fit.v_px)
     column = round(fit.u_px)
-    if not (0 <= row < h and 0 <= column < w and around.near[row, column]):
+    if not (0 <= row < h and 0 <= column < w and around.widened[row, column]):
         return False
-    inside = around.near & around.patch.used
+    inside = around.widened & around.patch.used
     seen_m = around.patch.residual_m[inside] - fit.offset_m
     left_m = seen_m - pictures(size.patch, fit.numbers[None], fit.shape)[0][inside]
     return bool(left_m @ left_m < (1.0 - EXPLAINED) * (seen_m @ seen_m))
@@ -680,7 +689,7 @@ def _by_contour(
     the depth, and what the blur moves a round contour. If no shape fits, the damage is ragged, and
     its depth is the mean one, volume over area; else it is the deepest."""
     residual_m = np.nan_to_num(around.sign * (around.patch.residual_m - around.offset_m))
-    hollow = around.invalid & parts_with(around.own | around.invalid, around.own)
+    hollow = around.invalid & parts_with(around.detected | around.invalid, around.detected)
     top_m = min(around.peak_m, OPEN_M)
     residual_m = np.minimum(residual_m, top_m)
     residual_m[hollow] = top_m
@@ -711,7 +720,7 @@ def _by_contour(
         volume_m3 = measured.volume_m3 / around.normal_share
         depth_m = volume_m3 / area_m2
         depth_se_m = abs(depth_m) * 2.0 * diameter_se_m / diameter_m
-    if hollow.sum() > around.own.sum():
+    if hollow.sum() > around.detected.sum():
         depth_m = np.nan
         depth_se_m = np.nan
     return replace(
@@ -734,7 +743,7 @@ def _contour(around: _Surroundings, residual_m: np.ndarray, level_m: float) -> n
     size = (CONTOUR_ZOOM * width, CONTOUR_ZOOM * height)
     fine_m = cv2.resize(residual_m, size, interpolation=cv2.INTER_LINEAR)
     seeds = cv2.resize(
-        around.own.astype(np.uint8),
+        around.detected.astype(np.uint8),
         size,
         interpolation=cv2.INTER_NEAREST,
     )

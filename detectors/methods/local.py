@@ -332,21 +332,32 @@ def _shares(
     spread_m: np.ndarray,
 ) -> np.ndarray:
     """Return the weight (n,) of each judged point: the median variance over its own, at most 4.
-    Variances come from the cloud's maker, or from the scatter of frames nearby plus what is fixed
-    in all frames; without either they are equal. That of the surface itself, of which ``spread_m``
-    (n,) is the root, is added. ``residual_m`` (n,)."""
+
+    The variance of a point is that of its z plus that of the surface itself.
+
+    Args:
+        cloud: may state the variances (`mean_variance_m2`).
+        judged: (h, w) bool.
+        residual_m: (n,), metres.
+        spread_m: (n,), standard deviation of the surface itself, metres."""
+    variances_m2 = _variances_m2(cloud, judged, residual_m)
+    variances_m2 = np.maximum(variances_m2 + spread_m**2, 1e-18)
+    return np.minimum(median_of(variances_m2) / variances_m2, 4.0)
+
+
+def _variances_m2(cloud: Cloud, judged: np.ndarray, residual_m: np.ndarray) -> np.ndarray:
+    """Return the variance (n,) of z of the judged points, whose residuals (n,) are given: as the
+    cloud's maker states it, or from the scatter of frames nearby plus what is fixed in all frames;
+    without either it is the same everywhere."""
     variance_m2 = sigma_of(residual_m) ** 2
     if cloud.mean_variance_m2 is not None:
-        variances = cloud.mean_variance_m2[judged]
-    else:
-        noise_m2 = average_variance_m2(cloud, judged)
-        if noise_m2 is None:
-            variances = np.full(len(residual_m), variance_m2)
-        else:
-            random = noise_m2[judged]
-            variances = random + max(variance_m2 - median_of(random), 0.0)
-    variances = np.maximum(variances + spread_m**2, 1e-18)
-    return np.minimum(median_of(variances) / variances, 4.0)
+        return cloud.mean_variance_m2[judged]
+    noise_m2 = average_variance_m2(cloud, judged)
+    if noise_m2 is None:
+        return np.full(len(residual_m), variance_m2)
+    random_m2 = noise_m2[judged]
+    fixed_m2 = max(variance_m2 - median_of(random_m2), 0.0)
+    return random_m2 + fixed_m2
 
 
 # --- the score of all filters ---

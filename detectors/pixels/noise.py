@@ -17,6 +17,8 @@ REACH_PIXELS = 5000
 """Least number of pixels valid in two frames: they show a correlation to 0.07 if 25 pixels are
 alike."""
 FARTHEST_LAG_PX = 30
+LARGEST_NOISE = 8.0
+"""Largest difference of two frames, over the mean one, that is noise: 6 deviations."""
 LONE_LEVEL_PX = 21  # side of the square of the local mean in a single frame
 LONE_SIGMAS = 5.0  # deviations that mark an edge there
 LONE_MOST_PX = 7
@@ -37,7 +39,7 @@ cameras average at most 5 pixels, and a measured reach scatters by one."""
 PART_PX = 160
 """Side of the parts of a picture whose noise is compared: 40 to 200 squares of wide noise."""
 PHASE_PX = 9  # side of the square of the local mean that shows where between two steps it lies
-LEAST_GAIN = 1e-3  # terms of the gain of rounding that are left out
+LEAST_GAIN = 1e-3  # weight up to which terms of the gain of rounding are left out
 LEAST_PASSED = 0.25
 """Mean product of two gains below which a correlation is not judged: means half a step apart pass
 little of what they share."""
@@ -152,8 +154,8 @@ def with_noise(cloud: Cloud, frames: Sequence[Frame], z_step_m: float) -> Cloud:
     place (`noise_sides_px`), by the frames that the cloud does not leave out."""
     reach_px = noise_reach_px(frames, z_step_m)
     left_out = {frame.name for frame in cloud.left_out}
-    kept = [frame for frame in frames if frame.name not in left_out]
-    sides_px = sides_if_upsampled(kept, reach_px, z_step_m)
+    averaged = [frame for frame in frames if frame.name not in left_out]
+    sides_px = sides_if_upsampled(averaged, reach_px, z_step_m)
     return replace(cloud, noise_reach_px=reach_px, noise_sides_px=sides_px)
 
 
@@ -247,7 +249,7 @@ def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | Non
     if window is None:
         return None
     usable = np.isfinite(window)
-    largest = 8 * float(np.abs(window[usable]).mean())
+    largest = LARGEST_NOISE * float(np.abs(window[usable]).mean())
     usable &= np.abs(np.nan_to_num(window)) < largest
     return _levelled(window, usable, 2 * FARTHEST_LAG_PX + 1), usable
 
@@ -344,42 +346,48 @@ def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | Non
     median over the parts around: one part errs by a tenth."""
     pictures = np.stack([frame.z_m.astype(np.float64) for frame in frames])
     mean_m = pictures.mean(axis=0)
-    known = np.isfinite(mean_m)
-    means_m = mean_m - _levelled(mean_m, known, PHASE_PX)
+    usable = np.isfinite(mean_m)
+    local_means_m = mean_m - _levelled(mean_m, usable, PHASE_PX)
     noise_m = np.diff(pictures, axis=0) / np.sqrt(2.0)
-    rows = _parts(mean_m.shape[0])
-    columns = _parts(mean_m.shape[1])
-    sides_px = np.zeros((2, len(rows), len(columns)))
-    for i, part_rows in enumerate(rows):
-        for j, part_columns in enumerate(columns):
-            part = part_rows, part_columns
-            noise = noise_m[:, part_rows, part_columns]
-            sides_px[:, i, j] = _sides_of_part(noise, known[part], means_m[part], z_step_m)
+    row_parts = _parts(mean_m.shape[0])
+    column_parts = _parts(mean_m.shape[1])
+    sides_px = np.zeros((2, len(row_parts), len(column_parts)))
+    for i, rows in enumerate(row_parts):
+        for j, columns in enumerate(column_parts):
+            sides_px[:, i, j] = _sides_of_part(
+                noise_m[:, rows, columns],
+                usable[rows, columns],
+                local_means_m[rows, columns],
+                z_step_m,
+            )
     sides_px[sides_px == 0.0] = np.nan
     smooth_px = ndimage.generic_filter(
         sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
     )
-    return smooth_px.astype(np.float32) if np.isfinite(smooth_px).all() else None
+    if not np.isfinite(smooth_px).all():
+        return None
+    return smooth_px.astype(np.float32)
 
 
 def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, float]:
     """Return the sides, along rows and along columns, of the rectangle over which noise is averaged
-    at a pixel of a cloud's grid; 0 where they are unknown."""
+    at a pixel of a cloud's grid, interpolated between the parts; 0 where they are unknown."""
     if cloud.noise_sides_px is None:
         return cloud.noise_reach_px, cloud.noise_reach_px
     _, rows, columns = cloud.noise_sides_px.shape
     height, width = cloud.points_m.shape[:2]
-    at_row = np.array([[(row + 0.5) * rows / height - 0.5]], np.float32)
-    at_column = np.array([[(column + 0.5) * columns / width - 0.5]], np.float32)
-    along_rows, along_columns = (
-        cv2.remap(sides, at_column, at_row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for sides in cloud.noise_sides_px
-    )
-    return float(along_rows[0, 0]), float(along_columns[0, 0])
+    part_row = np.array([[(row + 0.5) * rows / height - 0.5]], np.float32)
+    part_column = np.array([[(column + 0.5) * columns / width - 0.5]], np.float32)
+    border = cv2.BORDER_REPLICATE
+    sides_px = []
+    for parts_px in cloud.noise_sides_px:
+        side_px = cv2.remap(parts_px, part_column, part_row, cv2.INTER_LINEAR, borderMode=border)
+        sides_px.append(float(side_px[0, 0]))
+    return sides_px[0], sides_px[1]
 
 
 def _parts(length: int) -> list[slice]:
-    """Return equal parts of some `PART_PX` pixels."""
+    """Return the equal parts, of some `PART_PX` pixels, into which a ``length`` is cut."""
     count = max(1, round(length / PART_PX))
     ends = np.round(np.linspace(0, length, count + 1)).astype(int).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
@@ -387,26 +395,27 @@ def _parts(length: int) -> list[slice]:
 
 def _sides_of_part(
     noise_m: np.ndarray,
-    known: np.ndarray,
-    means_m: np.ndarray,
+    usable: np.ndarray,
+    local_means_m: np.ndarray,
     z_step_m: float,
 ) -> tuple[float, float]:
     """Return the sides, along rows and along columns, that the noise (k, h, w) of differences of
-    frames shows; 0 where it shows none. ``means_m`` (h, w): local means before the rounding."""
-    nothing = 0.0, 0.0
-    if known.sum() < REACH_PIXELS:
-        return nothing
-    sizes_m = np.abs(np.where(known, noise_m, 0.0)).max(axis=0)
-    usable = known & (sizes_m < 8.0 * sizes_m[known].mean())
+    frames shows at usable pixels (h, w); 0 where it shows none. ``local_means_m`` (h, w): before
+    the rounding."""
+    if usable.sum() < REACH_PIXELS:
+        return 0.0, 0.0
+    sizes_m = np.abs(np.where(usable, noise_m, 0.0)).max(axis=0)
+    usable = usable & (sizes_m < LARGEST_NOISE * sizes_m[usable].mean())
     offsets_m = noise_m[:, usable].mean(axis=1)
-    noise = np.where(usable, noise_m - offsets_m[:, None, None], 0.0)
-    variance_m2 = _before_rounding_m2(float(np.square(noise[:, usable]).mean()), z_step_m)
+    centred_m = np.where(usable, noise_m - offsets_m[:, None, None], 0.0)
+    rounded_m2 = float(np.square(centred_m[:, usable]).mean())
+    variance_m2 = _before_rounding_m2(rounded_m2, z_step_m)
     if variance_m2 <= (SMALLEST_STEPS * z_step_m) ** 2:
-        return nothing
-    gains = _gains(means_m, variance_m2, z_step_m) * usable
-    pairs = len(noise) * variance_m2
-    along_rows = _end_of_correlation(noise, gains, pairs)
-    along_columns = _end_of_correlation(noise.transpose(0, 2, 1), gains.T, pairs)
+        return 0.0, 0.0
+    gains = _gains(local_means_m, variance_m2, z_step_m) * usable
+    total_m2 = len(centred_m) * variance_m2
+    along_rows = _end_of_correlation(centred_m, gains, total_m2)
+    along_columns = _end_of_correlation(centred_m.transpose(0, 2, 1), gains.T, total_m2)
     return along_rows, along_columns
 
 
@@ -420,7 +429,8 @@ def _before_rounding_m2(variance_m2: float, z_step_m: float) -> float:
     for _ in range(30):
         middle_m2 = 0.5 * (low_m2 + high_m2)
         fixed_m2 = rounding_left_m2(z_step_m, middle_m2)
-        if middle_m2 + z_step_m**2 / 12.0 - fixed_m2 > variance_m2:
+        rounded_m2 = middle_m2 + z_step_m**2 / 12.0 - fixed_m2
+        if rounded_m2 > variance_m2:
             high_m2 = middle_m2
         else:
             low_m2 = middle_m2
@@ -429,32 +439,36 @@ def _before_rounding_m2(variance_m2: float, z_step_m: float) -> float:
 
 def _gains(means_m: np.ndarray, variance_m2: float, z_step_m: float) -> np.ndarray:
     """Return by how much the mean of rounded values changes with that of the values before, whose
-    means (h, w) and variance are known (Bussgang 1952): 1 on average over a step q, and 1 + 2
+    means (h, w) and variance s^2 are known (Bussgang 1952): 1 on average over a step q, and 1 + 2
     sum_k (-1)^k cos(2 pi k mean / q) exp(-2 (pi k s / q)^2)."""
     gains = np.ones(means_m.shape)
     if z_step_m <= 0:
         return gains
-    cycles = 2.0 * np.pi * np.nan_to_num(means_m) / z_step_m
-    k = 1
+    phases_rad = 2.0 * np.pi * np.nan_to_num(means_m) / z_step_m
     factor = np.exp(-2.0 * np.pi**2 * variance_m2 / z_step_m**2)
-    while factor ** (k**2) > LEAST_GAIN:
-        gains += 2.0 * (-1) ** k * factor ** (k**2) * np.cos(k * cycles)
+    k = 1
+    weight = factor
+    while weight > LEAST_GAIN:
+        gains += 2.0 * (-1) ** k * weight * np.cos(k * phases_rad)
         k += 1
+        weight = factor ** (k**2)
     return gains
 
 
-def _end_of_correlation(noise: np.ndarray, gains: np.ndarray, pairs_m2: float) -> float:
+def _end_of_correlation(noise_m: np.ndarray, gains: np.ndarray, total_m2: float) -> float:
     """Return the first lag along rows at which noise (k, h, w), over the product of the gains (h,
     w), correlates less than `SHARED`; 0 if there is none. Lags are left out at which rounding
-    passes less than `LEAST_PASSED` of the correlation. ``pairs_m2``: k times its variance before
+    passes less than `LEAST_PASSED` of the correlation. ``total_m2``: k times the variance before
     the rounding."""
-    width = noise.shape[2]
+    width = noise_m.shape[2]
     usable = gains != 0.0
     for lag in range(1, min(FARTHEST_LAG_PX, width)):
-        count = int((usable[:, lag:] & usable[:, : width - lag]).sum())
-        product = float(np.einsum("kij,kij->", noise[..., lag:], noise[..., : width - lag]))
-        expected = float(np.einsum("ij,ij->", gains[:, lag:], gains[:, : width - lag]))
-        is_passed = expected >= LEAST_PASSED * count
-        if is_passed and product < SHARED * pairs_m2 * expected:
+        first = slice(0, width - lag)
+        second = slice(lag, width)
+        pairs = int((usable[:, second] & usable[:, first]).sum())
+        product_m2 = float(np.einsum("kij,kij->", noise_m[..., second], noise_m[..., first]))
+        passed = float(np.einsum("ij,ij->", gains[:, second], gains[:, first]))
+        is_judged = passed >= LEAST_PASSED * pairs
+        if is_judged and product_m2 < SHARED * total_m2 * passed:
             return float(lag)
     return 0.0

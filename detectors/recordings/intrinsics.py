@@ -303,7 +303,8 @@ def read_lens(path: Path, width: int, height: int) -> Lens:
             fix="give the lens of the depth images (or of the colour camera they are aligned to)",
         )
     fx, fy, cx, cy = _focal_and_centre(path, data)
-    if across != width:  # also because the shift by half a pixel and back may round
+    # a lens of the images' own size stays as it is written: a shift by half a pixel and back rounds
+    if across != width:
         side = across / width
         fx = fx / side
         fy = fy / side

@@ -70,22 +70,23 @@ SEEN = 0.5
 class Background:
     """The surface without its damage; maps are NaN where it is not judged."""
 
-    # z of the surface (h, w), metres
     surface_z_m: np.ndarray
-    # z of the cloud minus the surface (h, w), metres
+    """(h, w): z of the surface, metres."""
     residual_m: np.ndarray
-    # standard deviation of the residuals nearby (h, w), without the surface's own misfit
+    """(h, w): z of the cloud minus the surface, metres."""
     noise_m: np.ndarray
-    # standard deviation of the surface itself (h, w), metres: 0 but beside steps of a profile
+    """(h, w): standard deviation of the residuals nearby, without the surface's own misfit."""
     spread_m: np.ndarray
-    # the shape's name and limits, as programs print them
+    """(h, w): standard deviation of the surface itself, metres: 0 except beside steps of a
+    profile."""
     description: str
-    # width above which a free form follows shallow damage; None for other shapes
+    """The shape's name and limits, as programs print them."""
     scale_m: float | None
-    # a sentence if remaining structure could be mistaken for damage, else ""
+    """Width above which a free form follows shallow damage; None for other shapes."""
     warning: str
-    # facts by name, as they are recorded
+    """A sentence if remaining structure could be mistaken for damage; else empty."""
     notes: dict[str, Any]
+    """Facts by name, as they are recorded."""
 
 
 @dataclass(frozen=True)
@@ -242,9 +243,9 @@ def _of_few_points(
 def _shape_of(
     points: np.ndarray, cells: _Cells, config: SurfaceConfig, rounding_m: float
 ) -> tuple[_Shape, _Cells, Profile | None]:
-    """Choose the shape of points (n, 3), refine its fit with cells centred on it, and return
-    both, and the profile that it contains. ``rounding_m``: deviation that rounding leaves in the
-    points."""
+    """Choose the shape of points (n, 3), refine its fit with cells centred on it, and return both,
+    with the profile that it contains, if any. ``rounding_m``: deviation that rounding leaves in
+    the points."""
     sample = points[:: max(1, len(points) // 8192)]
     _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"), cells.central)
     cells = cells.refreshed(points[:, 2] - start(points), start)

@@ -106,6 +106,10 @@ class Profile:
         """Return the number (n,) of the knot nearest to each place."""
         return np.rint((slopes - self.first) / self.step).astype(np.int64)
 
+    def knots_of(self, points: np.ndarray) -> np.ndarray:
+        """Return the number (n,) of the curve's knot nearest to each of the points (n, 3)."""
+        return self.knots(self.slopes(points)).clip(0, len(self.curve) - 1)
+
     def _curve_at(self, slopes: np.ndarray) -> np.ndarray:
         position = np.clip((slopes - self.first) / self.step, 0.0, len(self.curve) - 1.0)
         left = np.minimum(np.nan_to_num(position).astype(np.int64), len(self.curve) - 2)
@@ -123,7 +127,7 @@ class Profile:
     def fitted(self, points: np.ndarray) -> Profile:
         """Return the profile with the curve of medians of points (n, 3).
 
-        Points so far across that their rays graze the profile count at the ends of the curve."""
+        Points so far across that their rays graze the surface count at the ends of the curve."""
         slopes = self.slopes(points)
         middle = float(np.median(slopes))
         reach = 0.5 * MOST_STRIPS * self.step
@@ -137,50 +141,51 @@ class Profile:
         curve = _filled(curve)
         # on a slope, values beside a knot differ from it by the slope itself
         result = replace(result, curve=curve)
-        rest = group_medians(values - result._curve_at(slopes), knots, count)[0]
-        return replace(result, curve=curve + np.nan_to_num(rest))
+        corrections = group_medians(values - result._curve_at(slopes), knots, count)[0]
+        return replace(result, curve=curve + np.nan_to_num(corrections))
 
     def spread_at(self, points: np.ndarray) -> np.ndarray:
         """Return the deviation (n,) by which the surface may be wrong at points (n, 3), metres."""
-        knots = self.knots(self.slopes(points)).clip(0, len(self.curve) - 1)
-        return self.spread_m[knots]
+        return self.spread_m[self.knots_of(points)]
 
     def with_spread(self, points: np.ndarray) -> Profile:
         """Return the profile with its own deviation beside steps, as points (n, 3) show it.
 
-        A strip beside a step holds pixels of both of its sides, and its median is one of them. What
-        the residuals of a strip exceed a usual strip's by is counted, at the quantile `OF_BANDS` of
-        the bands along the direction, and up to the bend of the curve over
-        `STEP_KNOTS` beyond what a curvature over `CURVED_KNOTS` explains."""
-        ahead_m = _filled(1.0 / self.curve if self.central else self.curve)
-        share = (STEP_KNOTS / CURVED_KNOTS) ** 2
-        bends_m = np.abs(_bends(ahead_m, STEP_KNOTS) - share * _bends(ahead_m, CURVED_KNOTS))
-        widest_m = maximum_filter1d(bends_m, 2 * STEP_KNOTS + 1)
+        A strip beside a step holds pixels of both of its sides, and its median is one of them. Its
+        variance, less a usual strip's, is that of the surface. It counts at the quantile `OF_BANDS`
+        of the bands along the direction, and up to the square of the step's height nearby."""
         count = len(self.curve)
-        knots = self.knots(self.slopes(points)).clip(0, count - 1)
-        residuals_m = np.nan_to_num(points[:, 2] - self(points))
-        strips = _bands(self.lengths(points)) * count + knots
-        numbers = np.bincount(strips, minlength=BANDS * count)
-        noise_m2 = group_medians(residuals_m**2, knots, count)[0] / 0.6745**2
+        knots = self.knots_of(points)
+        heights_m2 = self._step_heights_m() ** 2
+        squares_m2 = np.nan_to_num(points[:, 2] - self(points)) ** 2
+        noise_m2 = group_medians(squares_m2, knots, count)[0] / 0.6745**2
         usual_m2 = float(np.nanmedian(noise_m2))
-        squares_m2 = np.minimum(residuals_m**2, widest_m[knots] ** 2 + usual_m2)
-        sums_m2 = np.bincount(strips, squares_m2, BANDS * count)
-        means_m2 = np.where(numbers >= LEAST_POINTS, sums_m2, np.nan) / np.maximum(numbers, 1)
+        limited_m2 = np.minimum(squares_m2, heights_m2[knots] + usual_m2)
+        means_m2 = _means_in_bands(limited_m2, _bands(self.lengths(points)), knots, count)
         with warnings.catch_warnings():
+            # no band shows a strip of few points
             warnings.simplefilter("ignore", RuntimeWarning)
-            variance_m2 = np.nanquantile(means_m2.reshape(BANDS, count), OF_BANDS, axis=0)
+            variance_m2 = np.nanquantile(means_m2, OF_BANDS, axis=0)
         excess_m2 = np.nan_to_num(variance_m2 - usual_m2)
-        limited_m2 = np.minimum(excess_m2, widest_m**2)
-        is_large = limited_m2 > usual_m2
-        return replace(self, spread_m=np.sqrt(np.where(is_large, limited_m2, 0.0)))
+        own_m2 = np.minimum(excess_m2, heights_m2)
+        spread_m2 = np.where(own_m2 > usual_m2, own_m2, 0.0)
+        return replace(self, spread_m=np.sqrt(spread_m2))
+
+    def _step_heights_m(self) -> np.ndarray:
+        """Return the largest height (k,) of a step within `STEP_KNOTS` of each knot: the bend of
+        the curve over these beyond what a curvature over `CURVED_KNOTS` explains."""
+        ahead_m = _filled(1.0 / self.curve if self.central else self.curve)
+        bends_m = _bends(ahead_m, STEP_KNOTS)
+        # the bend of a parabola grows with the square of the distance
+        curvature_share = (STEP_KNOTS / CURVED_KNOTS) ** 2
+        curved_m = curvature_share * _bends(ahead_m, CURVED_KNOTS)
+        return np.asarray(maximum_filter1d(np.abs(bends_m - curved_m), 2 * STEP_KNOTS + 1))
 
     def trusted(self, points: np.ndarray) -> Profile:
         """Return the profile, unknown where points (n, 3) show less than `LEAST_LENGTH_M` of it,
         and beside steps."""
-        slopes = self.slopes(points)
         count = len(self.curve)
-        knots = self.knots(slopes).clip(0, count - 1)
-        number = np.bincount(knots, minlength=count)
+        number = np.bincount(self.knots_of(points), minlength=count)
         # the visible length: the number of points, each a knot's distance long
         # at each knot; a parallel projection has no distance, and steps are metres
         distance_m = np.abs(1.0 / self.curve) if self.central else np.ones(count)
@@ -402,10 +407,26 @@ def _turned(profile: Profile, angles: np.ndarray) -> Profile:
 
 
 def _bands(lengths: np.ndarray) -> np.ndarray:
-    """Return the band (n,) of places along the direction, from 0."""
+    """Return the number (n,) of the band, from 0, in which each of the ``lengths`` (n,) along the
+    direction lies."""
     extent = max(float(np.ptp(lengths)), 1e-12)
-    band = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
-    return np.minimum(band, BANDS - 1)
+    bands = (BANDS * (lengths - lengths.min()) / extent).astype(np.int64)
+    return np.minimum(bands, BANDS - 1)
+
+
+def _means_in_bands(
+    values: np.ndarray,
+    bands: np.ndarray,
+    knots: np.ndarray,
+    count: int,
+) -> np.ndarray:
+    """Return the means (`BANDS`, k) of values (n,) that lie in the same band and at the same of
+    ``count`` knots; NaN where there are fewer than `LEAST_POINTS`."""
+    strips = bands * count + knots
+    numbers = np.bincount(strips, minlength=BANDS * count)
+    sums = np.bincount(strips, values, BANDS * count)
+    means = np.where(numbers >= LEAST_POINTS, sums, np.nan) / np.maximum(numbers, 1)
+    return means.reshape(BANDS, count)
 
 
 def explains_better(
@@ -426,24 +447,25 @@ def explains_better(
         inside = band % 2 == parity
         if not inside.any() or inside.all():
             return False
-        other = profile.fitted(points[~inside])
-        errors = np.abs(points[inside, 2] - other(points[inside]))
+        predicting = profile.fitted(points[~inside])
+        errors = np.abs(points[inside, 2] - predicting(points[inside]))
         noise = float(np.nanmedian(errors)) / 0.6745
         limit = CLIP_SIGMAS * noise
         sizes = np.abs(departures[inside])
-        knots = other.knots(other.slopes(points)).clip(0, len(other.curve) - 1)
-        medians, _ = group_medians(departures[~inside], knots[~inside], len(other.curve))
+        knots = predicting.knots_of(points)
+        medians, _ = group_medians(departures[~inside], knots[~inside], len(predicting.curve))
         least_m = max(SEEN * noise, ROUNDED * rounding_m)
         departs = np.abs(np.nan_to_num(medians)) > least_m
         gains = (sizes.clip(max=limit) - errors.clip(max=limit)) / noise
         gain[inside] = np.where(departs[knots[inside]], gains, np.nan)
     # where the surface is too steep to be judged, no smooth fit is good, and it does not matter
-    known = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
-    counts = np.bincount(band[known], minlength=BANDS)
+    is_judged = np.isfinite(gain) & np.isfinite(profile.trusted(points)(points))
+    counts = np.bincount(band[is_judged], minlength=BANDS)
     enough = counts >= LEAST_POINTS
     if enough.sum() <= BANDS / 2:
         return False
-    means = np.bincount(band[known], gain[known], minlength=BANDS)[enough] / counts[enough]
+    sums = np.bincount(band[is_judged], gain[is_judged], minlength=BANDS)
+    means = sums[enough] / counts[enough]
     standard_error = float(means.std(ddof=1)) / math.sqrt(len(means))
     return float(means.mean()) > GAIN_SIGMAS * standard_error
 

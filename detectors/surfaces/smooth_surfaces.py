@@ -180,8 +180,8 @@ def _with_faces(
     flats and webs. ``unbroken`` (h, w): numbers of the areas without a step, which end no surface
     at a crease.
 
-    Faces no wider than the smoothing's reach on both sides are none: beside a rim, the lens's blur
-    and the camera's filter make such a ramp to a strip of what lies a little behind."""
+    What is no wider than the smoothing's ``reach`` on both sides is no face: beside a rim, the
+    lens's blur and the camera's filter make such a ramp to a strip of what lies a little behind."""
     surfaces = list(masks)
     for number in _areas_of(masks, unbroken):
         area = unbroken == number
@@ -201,7 +201,8 @@ def _with_faces(
 def _is_wide(faces: np.ndarray, reach: int) -> bool:
     """Return whether a place in the mask (h, w) is farther than ``reach`` pixels from its rim, to
     which the picture's edge belongs."""
-    return bool(shrunk(np.pad(faces, 1), 2 * reach + 1)[1:-1, 1:-1].any())
+    inner = shrunk(np.pad(faces, 1), 2 * reach + 1)[1:-1, 1:-1]
+    return bool(inner.any())
 
 
 def _areas_of(masks: np.ndarray, unbroken: np.ndarray) -> list[int]:

@@ -490,8 +490,8 @@ surface."""
 RAY_STEP = 1e-4
 """Share of a point's range by which it is moved along its ray to see how the surface falls off."""
 LEAST_OPENING = 0.05
-"""Least slope between a ray and the surface that counts: 87 degrees off the normal, where nothing
-is judged."""
+"""Least rate, per z, at which a point that moves along its ray leaves the surface: 87 degrees off
+the normal, where nothing is judged."""
 # share of the largest diagonal element, added to every one so that normal equations stay regular
 RIDGE = 1e-9
 
@@ -503,9 +503,11 @@ def along_rays(fit: Fit) -> Fit:
 
     def z_at(points: np.ndarray) -> np.ndarray:
         z = points[:, 2]
-        below = fit(points)
-        slope = (fit(points * (1.0 + RAY_STEP)) - below) / (RAY_STEP * z)
-        return np.asarray(z + (below - z) / np.maximum(1.0 - slope, LEAST_OPENING))
+        surface_z = fit(points)
+        farther_z = fit(points * (1.0 + RAY_STEP))
+        slope = (farther_z - surface_z) / (RAY_STEP * z)
+        opening = np.maximum(1.0 - slope, LEAST_OPENING)
+        return np.asarray(z + (surface_z - z) / opening)
 
     return z_at
 

@@ -42,10 +42,10 @@ def time_shares(facts: ExposuresFacts, fullness: np.ndarray) -> np.ndarray:
     if facts.bright_share is not None:
         brightest = np.quantile(fullness, 1 - facts.bright_share.value)
         deciding = np.full_like(fullness, brightest)
-    longest_fit = facts.fill.value / np.maximum(deciding, DARKEST)
+    longest_fitting = facts.fill.value / np.maximum(deciding, DARKEST)
     shares = np.array(facts.shares.value)
     if facts.continuous.value:
-        return np.clip(longest_fit, shares[-1], shares[0])
+        return np.clip(longest_fitting, shares[-1], shares[0])
     rising = shares[::-1]
-    number = np.searchsorted(rising, longest_fit, side="right") - 1
-    return np.asarray(rising[np.maximum(number, 0)])
+    index = np.searchsorted(rising, longest_fitting, side="right") - 1
+    return np.asarray(rising[np.maximum(index, 0)])

@@ -102,21 +102,25 @@ def blur_weights(sigma_px: float) -> np.ndarray:
     reach_px = int(np.ceil(4 * sigma_px))
     places_px = np.linspace(-reach_px - 1, reach_px + 1, 200 * (reach_px + 1) + 1)
 
-    def sharp(distance_px: np.ndarray) -> np.ndarray:
+    def sharp_edge(distance_px: np.ndarray) -> np.ndarray:
+        """Light of a pixel so far behind a sharp edge."""
         return np.clip(distance_px + 0.5, 0, 1)
 
-    def until(distance_px: np.ndarray) -> np.ndarray:
-        """Integral of the Gaussian's step up to this distance."""
+    def blurred_integral(distance_px: np.ndarray) -> np.ndarray:
+        """Integral of the blurred edge up to this distance."""
         x = distance_px / sigma_px
-        return sigma_px * (x * special.ndtr(x) + np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi))
+        density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+        return sigma_px * (x * special.ndtr(x) + density)
 
-    blurred = until(places_px + 0.5) - until(places_px - 0.5)
-    changes = []
+    blurred = blurred_integral(places_px + 0.5) - blurred_integral(places_px - 0.5)
+    sharp = sharp_edge(places_px)
+    changes = []  # by a weight of 1 of the two pixels n away, which the middle one loses
     for n in range(1, reach_px + 1):
-        pair = sharp(places_px - n) + sharp(places_px + n)
-        changes.append(pair - 2 * sharp(places_px))
-    outer, _ = optimize.nnls(np.stack(changes, axis=1), blurred - sharp(places_px))
-    return np.concatenate([outer[::-1], [1 - 2 * outer.sum()], outer])
+        pair = sharp_edge(places_px - n) + sharp_edge(places_px + n)
+        changes.append(pair - 2 * sharp)
+    outer, _ = optimize.nnls(np.stack(changes, axis=1), blurred - sharp)
+    middle = 1 - 2 * outer.sum()
+    return np.concatenate([outer[::-1], [middle], outer])
 
 
 def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
@@ -198,24 +202,24 @@ class AmcwImager(UnitModel[AmcwCamera]):
         electrons = photons.signal_electrons.value * self.gathered
         signal = self._demodulated(phasor, electrons)
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
-        times = self._time_shares(signal, both_wells)
-        scaled = times
+        time_share = self._time_shares(signal, both_wells)
+        scaled_share = time_share
         if self.camera.exposures is not None and self.camera.exposures.for_frame:
             # these samples are not scaled: the engine sees the amplitudes of the shorter exposure
-            signal = signal * times
-            both_wells = both_wells * times
-            scaled = np.ones_like(times)
+            signal = signal * time_share
+            both_wells = both_wells * time_share
+            scaled_share = np.ones_like(time_share)
         # shot noise of both wells, and the read noise of each
-        read_noise = photons.read_noise_electrons.value / scaled
-        variance = both_wells / scaled + 2 * read_noise**2
+        read_noise = photons.read_noise_electrons.value / scaled_share
+        variance = both_wells / scaled_share + 2 * read_noise**2
         sigma = np.sqrt(variance) if effects.noise else np.zeros_like(variance)
-        limit = self._largest_sample(both_wells, scaled)
+        limit = self._largest_sample(both_wells, scaled_share)
         per_unit = photons.electrons_per_unit.value
         return AmcwExposure(
             means=self._samples(signal / per_unit),
             sigma=(sigma / per_unit).ravel().astype(f4),
             limit=limit.ravel().astype(f4),
-            time_share=times.ravel().astype(f4),
+            time_share=time_share.ravel().astype(f4),
             shape=intensity.shape,
         )
 
@@ -263,18 +267,22 @@ class AmcwImager(UnitModel[AmcwCamera]):
             samples[:, k] = flat.real * np.cos(step) + flat.imag * np.sin(step)
         return samples
 
-    def _largest_sample(self, both_wells: np.ndarray, scaled: np.ndarray) -> np.ndarray:
+    def _largest_sample(self, both_wells: np.ndarray, scaled_share: np.ndarray) -> np.ndarray:
         """Return the largest sample (h, w) that fits, in converter units; infinite if saturation
-        is off. ``both_wells`` (h, w): electrons of the longest exposure, to which samples of
-        ``scaled`` (h, w) times that exposure are scaled after conversion."""
+        is off.
+
+        Args:
+            both_wells: (h, w), electrons of the exposure to which samples are scaled.
+            scaled_share: (h, w), the exposure in which they are taken over that one; samples are
+                scaled after conversion."""
         if not self.config.effects.saturation:
             return np.full(both_wells.shape, np.inf)
         photons = self.camera.photons
-        limit = self.camera.converter.full_scale_units.value / scaled
+        limit = self.camera.converter.full_scale_units.value / scaled_share
         if photons.full_well_electrons is None:
             return np.asarray(limit)
         # the fuller well holds half of both wells' electrons and half the sample
-        room = 2 * photons.full_well_electrons.value / scaled - both_wells
+        room = 2 * photons.full_well_electrons.value / scaled_share - both_wells
         return np.clip(room / photons.electrons_per_unit.value, 0, limit)
 
     def ambient_electrons(self, view: NoiseFreeView, intensity: np.ndarray) -> np.ndarray:
