@@ -1,6 +1,7 @@
 """Robust statistics, and the noise of an average: the error that rounding leaves, and the range of
 shared noise."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -361,9 +362,12 @@ def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | Non
                 z_step_m,
             )
     sides_px[sides_px == 0.0] = np.nan
-    smooth_px = ndimage.generic_filter(
-        sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
-    )
+    with warnings.catch_warnings():
+        # parts without pixels, as where upsampled depth fills the middle of a picture only
+        warnings.simplefilter("ignore", RuntimeWarning)
+        smooth_px = ndimage.generic_filter(
+            sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
+        )
     if not np.isfinite(smooth_px).all():
         return None
     return smooth_px.astype(np.float32)

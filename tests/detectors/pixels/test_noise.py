@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -265,6 +266,17 @@ def test_wide_noise_far_below_a_step_is_not_judged_where_rounding_hides_it() -> 
     assert sides_px is not None
     assert np.median(sides_px[0][:, 4:]) == pytest.approx(20.0, abs=2.0)
     assert np.median(sides_px[1][:, 4:]) == pytest.approx(12.5, abs=1.5)
+
+
+def test_a_picture_with_empty_parts_has_no_sides_and_no_warning() -> None:
+    """The left half has no range, as beyond the edge of the depth camera's view."""
+    empty = np.full((480, 960), np.nan, np.float32)
+    frames = []
+    for frame in upsampled_frames(0.3, 0.0):
+        frames.append(replace(frame, z_m=np.where(np.arange(960) < 480, empty, frame.z_m)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert noise_sides_px(frames, 0.0) is None
 
 
 def test_the_sides_at_the_middle_of_a_part_are_those_of_the_part() -> None:
