@@ -166,8 +166,7 @@ class Profile:
             # no band shows a strip of few points
             warnings.simplefilter("ignore", RuntimeWarning)
             variance_m2 = np.nanquantile(means_m2, OF_BANDS, axis=0)
-        excess_m2 = np.nan_to_num(variance_m2 - usual_m2)
-        own_m2 = np.minimum(excess_m2, heights_m2)
+        own_m2 = np.nan_to_num(variance_m2 - usual_m2)
         spread_m2 = np.where(own_m2 > usual_m2, own_m2, 0.0)
         return replace(self, spread_m=np.sqrt(spread_m2))
 
