@@ -41,16 +41,29 @@ Digests = dict[str, str]
 def code_digests(modules: Iterable[str]) -> Digests:
     """Return the digest of each room of counted sources that modules reach by imports. A module of
     another project is a part of its own, with all sources of its package."""
-    own = sorted(name for name in modules if name.partition(".")[0] in provenance.OWN)
-    rooms: dict[str, list[Path]] = {}
-    for path in provenance.reached_sources(tuple(own)):
-        shown = path.relative_to(provenance.ROOT)
-        if shown.as_posix().startswith(COUNTED):
-            rooms.setdefault(shown.parent.as_posix(), []).append(path)
-    digests = {room: _together(paths) for room, paths in rooms.items()}
-    for name in sorted(set(modules) - set(own)):
-        digests[name.partition(".")[0]] = provenance.source_digest((name,), ())[:DIGITS]
+    project_modules = []
+    foreign_modules = []
+    for name in sorted(set(modules)):
+        if _package_of(name) in provenance.OWN:
+            project_modules.append(name)
+        else:
+            foreign_modules.append(name)
+    paths_by_room: dict[str, list[Path]] = {}
+    for path in provenance.reached_sources(tuple(project_modules)):
+        relative = path.relative_to(provenance.ROOT)
+        if relative.as_posix().startswith(COUNTED):
+            room = relative.parent.as_posix()
+            paths_by_room.setdefault(room, []).append(path)
+    digests = {room: _files_digest(paths) for room, paths in paths_by_room.items()}
+    for name in foreign_modules:
+        foreign_digest = provenance.source_digest((name,), ())
+        digests[_package_of(name)] = foreign_digest[:DIGITS]
     return digests
+
+
+def _package_of(module: str) -> str:
+    """Return the outermost package of a module."""
+    return module.partition(".")[0]
 
 
 def file_digests(names: Iterable[str]) -> Digests:
@@ -60,7 +73,10 @@ def file_digests(names: Iterable[str]) -> Digests:
     digests = {}
     for name in names:
         path = provenance.ROOT / name
-        digests[name] = _together(path.rglob("*.py")) if path.is_dir() else _of_file(path)
+        if path.is_dir():
+            digests[name] = _files_digest(path.rglob("*.py"))
+        else:
+            digests[name] = _file_digest(path)
     return digests
 
 
@@ -70,39 +86,42 @@ def changed_parts(stored: Mapping[str, str], now: Mapping[str, str]) -> list[str
     return sorted(part for part in parts if stored.get(part) != now.get(part))
 
 
-def _together(paths: Iterable[Path]) -> str:
+def _files_digest(paths: Iterable[Path]) -> str:
     """Return the digest of files with their names."""
-    return digest([[path.name, _of_file(path)] for path in sorted(paths)])[:DIGITS]
+    digests_by_name = [[path.name, _file_digest(path)] for path in sorted(paths)]
+    return digest(digests_by_name)[:DIGITS]
 
 
-def _of_file(path: Path) -> str:
+def _file_digest(path: Path) -> str:
     """Return the digest of a file's content."""
     if path.suffix == ".py":
-        return _of_source(path)
+        return _syntax_digest(path)
     if not path.is_file():
         return "absent"
     content = path.read_bytes()
     if path.suffix == ".yaml":
         # not by `read_yaml`, whose room imports this one's
-        return digest(YAML(typ="safe", pure=True).load(content))[:DIGITS]
+        data = YAML(typ="safe", pure=True).load(content)
+        return digest(data)[:DIGITS]
     return hashlib.blake2b(content).hexdigest()[:DIGITS]
 
 
 @cache
-def _of_source(path: Path) -> str:
+def _syntax_digest(path: Path) -> str:
     """Return the digest of a Python source, as this process first read it: what a process makes
     comes from the code that it runs."""
-    syntax = _syntax(ast.parse(provenance._content(path)))
-    return hashlib.blake2b(" ".join(syntax).encode()).hexdigest()[:DIGITS]
+    tree = ast.parse(provenance.first_content(path))
+    words = " ".join(_syntax_words(tree))
+    return hashlib.blake2b(words.encode()).hexdigest()[:DIGITS]
 
 
-def _syntax(node: Any) -> Iterator[str]:
+def _syntax_words(node: Any) -> Iterator[str]:
     """Yield a syntax tree as words, without docstrings. Empty fields are left out, as versions of
     Python differ in them."""
     if isinstance(node, list):
         yield "["
         for item in node:
-            yield from _syntax(item)
+            yield from _syntax_words(item)
         yield "]"
     elif not isinstance(node, ast.AST):
         yield repr(node)
@@ -112,7 +131,7 @@ def _syntax(node: Any) -> Iterator[str]:
             value = getattr(node, name, None)
             if name not in NOT_SYNTAX and value is not None and value != []:
                 yield name
-                yield from _syntax(value)
+                yield from _syntax_words(value)
 
 
 def _is_docstring(node: ast.AST) -> bool:

@@ -163,7 +163,7 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
     for name in sorted(set(modules) - set(own_modules)):
         files |= {f"{name}/{relative}": path for relative, path in _foreign_sources(name)}
     for shown, path in sorted(files.items()):
-        content = _content(path)
+        content = first_content(path)
         state.update(f"{shown} {len(content)}\n".encode())
         state.update(content)
     for package in packages:
@@ -185,12 +185,12 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
             continue
         paths[name] = path
         waiting.append(name.rpartition(".")[0])  # a package's own code runs before its modules
-        waiting += _imported(_content(path).decode())
+        waiting += _imported(first_content(path).decode())
     return tuple(sorted(paths.values()))
 
 
 @cache
-def _content(path: Path) -> bytes:
+def first_content(path: Path) -> bytes:
     """Return a source as this process first read it: later edits do not affect this process or its
     forks."""
     return path.read_bytes()

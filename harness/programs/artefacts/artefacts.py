@@ -33,13 +33,14 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if a command fails, 2 for a user's mistake, 130 after
     Ctrl-C."""
     from harness.programs.artefacts.declaration import declared_artefacts, refuse_without_checkout
-    from harness.programs.artefacts.ledger import made_now, read_ledger, store_entry
+    from harness.programs.artefacts.ledger import entry_now, read_ledger, store_entry
     from harness.programs.artefacts.making import make_all
     from harness.programs.artefacts.quoted import write_quotations
 
     refuse_without_checkout()
     for name in options.made:
-        store_entry(name, made_now(name, None))
+        entry = entry_now(name, None)
+        store_entry(name, entry)
     failed = []
     if not options.ages and not options.made:
         for name in options.only or ():
@@ -59,10 +60,10 @@ def _refuse_by_hand(name: str) -> None:
 
     artefact = artefact_named(name)
     if artefact.by_hand:
-        how = "; ".join(artefact.commands) or "as its document describes"
+        instruction = "; ".join(artefact.commands) or "as its document describes"
         raise UserError(
             f"{name}: is made by hand",
-            fix=f"make it again ({how}), then run tofpod artefacts --made {name}",
+            fix=f"make it again ({instruction}), then run tofpod artefacts --made {name}",
         )
 
 

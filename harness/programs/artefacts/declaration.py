@@ -86,6 +86,8 @@ class Artefact(Config):
 
 
 class _File(Config):
+    """The file of artefacts."""
+
     artefacts: dict[str, Artefact]
     """By name, in the order in which they are made: the most valuable first."""
 
@@ -110,8 +112,9 @@ def artefact_named(name: str) -> Artefact:
     artefacts = declared_artefacts()
     if name not in artefacts:
         similar = nearest(name, artefacts)
-        meant = f"; did you mean {similar!r}?" if similar else ""
-        raise UserError(f"there is no artefact {name!r}{meant}", legal=", ".join(artefacts))
+        suggestion = f"; did you mean {similar!r}?" if similar else ""
+        message = f"there is no artefact {name!r}{suggestion}"
+        raise UserError(message, legal=", ".join(artefacts))
     return artefacts[name]
 
 
@@ -123,8 +126,10 @@ def data_file(name: str) -> str:
 def files_of(name: str) -> tuple[str, ...]:
     """Return the files that an artefact consists of, relative to the repository."""
     artefact = artefact_named(name)
-    data = (data_file(name),) if artefact.table is not None else ()
-    return (*artefact.stores, *artefact.writes, *data)
+    files = [*artefact.stores, *artefact.writes]
+    if artefact.table is not None:
+        files.append(data_file(name))
+    return tuple(files)
 
 
 def digests_today(name: str) -> Digests:
@@ -134,17 +139,20 @@ def digests_today(name: str) -> Digests:
     digests = code_digests(artefact.modules) | file_digests(artefact.inputs)
     for source in artefact.of:
         digests |= file_digests(files_of(source))
-    digests |= camera_digests(camera_names()) if artefact.every_camera else {}
+    if artefact.every_camera:
+        digests |= camera_digests(camera_names())
     for command in artefact.commands:
-        for part, value in _of_command(command).items():
+        for part, part_digest in _command_digests(command).items():
             # two experiments may reach different modules of a room
-            differs = digests.get(part, value) != value
-            digests[part] = digest([digests[part], value])[:DIGITS] if differs else value
+            stored = digests.get(part, part_digest)
+            if stored != part_digest:
+                part_digest = digest([stored, part_digest])[:DIGITS]
+            digests[part] = part_digest
     return digests
 
 
 @lru_cache
-def _of_command(command: str) -> Digests:
+def _command_digests(command: str) -> Digests:
     """Return the digests of the experiment that a command runs; none for other commands."""
     program, *words = shlex.split(command)
     if program != "tofpod" or words[0] not in STUDIES:

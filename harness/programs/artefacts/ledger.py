@@ -20,7 +20,7 @@ from harness.vocabulary.files import shipped, strict_json, write_json
 LEDGER = "artefacts.json"
 
 
-class Made(Config):
+class LedgerEntry(Config):
     """An entry of the ledger."""
 
     made: str
@@ -37,7 +37,7 @@ class Made(Config):
     """Digests of its files."""
 
 
-Ledger = Mapping[str, Made]
+Ledger = Mapping[str, LedgerEntry]
 
 
 def ledger_path() -> Path:
@@ -45,24 +45,29 @@ def ledger_path() -> Path:
     return shipped("baselines") / LEDGER
 
 
-def read_ledger() -> dict[str, Made]:
+def read_ledger() -> dict[str, LedgerEntry]:
     """Return how each artefact was made, by name."""
     path = ledger_path()
     data = strict_json(path.read_bytes()) if path.is_file() else {}
-    return {name: Made.from_data(made) for name, made in data.items()}
+    return {name: LedgerEntry.from_data(entry) for name, entry in data.items()}
 
 
-def store_entry(name: str, made: Made) -> None:
+def store_entry(name: str, entry: LedgerEntry) -> None:
     """Store how an artefact was made, beside the entries that other processes may have stored."""
-    ledger = read_ledger() | {name: made}
-    known = [name for name in declared_artefacts() if name in ledger]
-    write_json(ledger_path(), {name: ledger[name].to_data() for name in known})
+    ledger = read_ledger() | {name: entry}
+    data = {
+        declared_name: ledger[declared_name].to_data()
+        for declared_name in declared_artefacts()
+        if declared_name in ledger
+    }
+    write_json(ledger_path(), data)
 
 
-def made_now(name: str, seconds: float | None, *, quick: bool = False) -> Made:
+def entry_now(name: str, seconds: float | None, *, quick: bool = False) -> LedgerEntry:
     """Return the entry of an artefact that has just been made."""
-    return Made(
-        made=datetime.datetime.now(datetime.UTC).date().isoformat(),
+    today = datetime.datetime.now(datetime.UTC).date()
+    return LedgerEntry(
+        made=today.isoformat(),
         tofpod=__version__,
         seconds=seconds,
         quick=quick,
@@ -76,12 +81,12 @@ def changed_since(name: str, ledger: Ledger) -> list[str]:
     what is printed whenever documents are written."""
     if artefact_named(name).prints:
         return []
-    made = ledger.get(name)
-    if made is None:
+    entry = ledger.get(name)
+    if entry is None:
         return ["it was never made"]
-    if made.digests is None:
+    if entry.digests is None:
         return ["it does not state its code"]
-    return changed_parts(made.digests, digests_today(name))
+    return changed_parts(entry.digests, digests_today(name))
 
 
 def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
@@ -97,27 +102,29 @@ def reasons_it_is_older(name: str, ledger: Ledger) -> list[str]:
 
 def is_quick(name: str, ledger: Ledger) -> bool:
     """Return whether an artefact, or one that it is made of, comes from a quick run."""
-    made = ledger.get(name)
+    entry = ledger.get(name)
     sources = artefact_named(name).of
-    return bool(made and made.quick) or any(is_quick(source, ledger) for source in sources)
+    if entry is not None and entry.quick:
+        return True
+    return any(is_quick(source, ledger) for source in sources)
 
 
 def edited_files(name: str, ledger: Ledger) -> list[str]:
     """Return the files of an artefact that are not as they were made."""
-    made = ledger.get(name)
-    stored = {} if made is None else made.files
+    entry = ledger.get(name)
+    stored = {} if entry is None else entry.files
     return changed_parts(stored, file_digests(files_of(name)))
 
 
 def age_sentence(name: str, ledger: Ledger) -> str:
     """Return what a document says beside an artefact that is older than the code or comes from a
     quick run; an empty text beside any other."""
-    made = ledger.get(name)
-    if made is None:
+    entry = ledger.get(name)
+    if entry is None:
         return "*Not yet computed.*"
     if reasons_it_is_older(name, ledger):
-        by = f" by tofpod {made.tofpod}" if made.tofpod else ""
-        return f"*Older than the code: computed on {made.made}{by}.*"
+        maker = f" by tofpod {entry.tofpod}" if entry.tofpod else ""
+        return f"*Older than the code: computed on {entry.made}{maker}.*"
     if is_quick(name, ledger):
         return "*From a quick run: fewer boards or repeats, so wider intervals.*"
     return ""

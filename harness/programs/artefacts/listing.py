@@ -13,16 +13,16 @@ def ages() -> list[dict[str, Any]]:
     ledger = read_ledger()
     rows = []
     for name, artefact in declared_artefacts().items():
-        made = ledger.get(name)
+        entry = ledger.get(name)
         older_than = reasons_it_is_older(name, ledger)
         older_than += [f"{file} (edited)" for file in edited_files(name, ledger)]
         row = {
             "name": name,
             "about": artefact.about,
             "by_hand": artefact.by_hand,
-            "made": None if made is None else made.made,
-            "tofpod": None if made is None else made.tofpod,
-            "seconds": None if made is None else made.seconds,
+            "made": None if entry is None else entry.made,
+            "tofpod": None if entry is None else entry.tofpod,
+            "seconds": None if entry is None else entry.seconds,
             "expected_seconds": artefact.seconds,
             "older_than": older_than,
         }

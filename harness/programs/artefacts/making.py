@@ -12,7 +12,7 @@ from harness.programs.artefacts.ledger import (
     Ledger,
     changed_since,
     edited_files,
-    made_now,
+    entry_now,
     read_ledger,
     store_entry,
 )
@@ -29,14 +29,16 @@ def make_all(names: Iterable[str], *, quick: bool) -> list[str]:
     stored in the ledger at once, so that a run that is killed goes on where it was. Returns the
     names of those that fail."""
     ledger = read_ledger()
-    named = list(names)
-    due = due_of(named, ledger, quick=quick)
+    chosen = list(names)
+    due = due_of(chosen, ledger, quick=quick)
     expected_s = {name: _expected_s(name, ledger) for name in due}
-    print(f"{len(due)} of {len(named)} artefacts are to be made, in about", end=" ")
-    print(f"{sum(expected_s.values()) / 60:.0f} min on two idle cores", flush=True)
+    print(f"{len(due)} of {len(chosen)} artefacts are to be made, in about", end=" ")
+    expected_min = sum(expected_s.values()) / 60
+    print(f"{expected_min:.0f} min on two idle cores", flush=True)
     failed = []
     for name in due:
-        print(f"{name}: {artefact_named(name).about}; about {expected_s[name]:.0f} s", flush=True)
+        answer = artefact_named(name).about
+        print(f"{name}: {answer}; about {expected_s[name]:.0f} s", flush=True)
         began = time.monotonic()
         try:
             _make(name, quick=quick)
@@ -45,7 +47,9 @@ def make_all(names: Iterable[str], *, quick: bool) -> list[str]:
             failed.append(name)
             continue
         seconds = round(time.monotonic() - began, 1)
-        store_entry(name, made_now(name, seconds, quick=quick and _has_quick_form(name)))
+        was_quick = quick and _has_quick_form(name)
+        entry = entry_now(name, seconds, quick=was_quick)
+        store_entry(name, entry)
         print(f"{name}: made in {seconds:.0f} s", flush=True)
     return failed
 
@@ -59,7 +63,8 @@ def due_of(names: Iterable[str], ledger: Ledger, *, quick: bool) -> list[str]:
         artefact = artefact_named(name)
         if artefact.by_hand or artefact.prints:
             continue
-        is_older = bool(changed_since(name, ledger)) or any(source in due for source in artefact.of)
+        has_due_source = any(source in due for source in artefact.of)
+        is_older = has_due_source or bool(changed_since(name, ledger))
         if is_older or edited_files(name, ledger) or (ledger[name].quick and not quick):
             due.append(name)
     return due
@@ -67,10 +72,10 @@ def due_of(names: Iterable[str], ledger: Ledger, *, quick: bool) -> list[str]:
 
 def _expected_s(name: str, ledger: Ledger) -> float:
     """Return the seconds that the last whole run took, or else the declared ones."""
-    made = ledger.get(name)
-    if made is None or made.seconds is None or made.quick:
+    entry = ledger.get(name)
+    if entry is None or entry.seconds is None or entry.quick:
         return artefact_named(name).seconds
-    return made.seconds
+    return entry.seconds
 
 
 def _make(name: str, *, quick: bool) -> None:
@@ -83,9 +88,11 @@ def _make(name: str, *, quick: bool) -> None:
     for command in artefact.commands:
         _run(command, quick=quick)
     for file, source in artefact.stores.items():
-        write_bytes(provenance.ROOT / file, (provenance.ROOT / source).read_bytes())
+        content = (provenance.ROOT / source).read_bytes()
+        write_bytes(provenance.ROOT / file, content)
     if artefact.table is not None:
-        write_text(provenance.ROOT / data_file(name), stored_rows(artefact.table, artefact.rows))
+        rows = stored_rows(artefact.table, artefact.rows)
+        write_text(provenance.ROOT / data_file(name), rows)
 
 
 def _has_quick_form(name: str) -> bool:
@@ -97,13 +104,14 @@ def _run(command: str, *, quick: bool) -> None:
     """Run a command in the repository; its output goes to this terminal. Raises UserError if it
     ends with an error."""
     program, *words = shlex.split(command)
-    called = [program, *words]
+    arguments = [program, *words]
     if program == "tofpod":
-        called = [sys.executable, "-m", "harness", *words]
-        called += ["--quick"] if quick and [program, words[0]] == SWEEP else []
+        arguments = [sys.executable, "-m", "harness", *words]
+        if quick and [program, words[0]] == SWEEP:
+            arguments.append("--quick")
     if program == "python":
-        called = [sys.executable, *words]
-    code = subprocess.run(called, cwd=provenance.ROOT, check=False).returncode
+        arguments = [sys.executable, *words]
+    code = subprocess.run(arguments, cwd=provenance.ROOT, check=False).returncode
     if code == 130:
         raise KeyboardInterrupt
     if code:

@@ -71,7 +71,7 @@ def quotation(name: str, document: str, ledger: Ledger) -> str:
 
 def quoted_in(text: str) -> list[tuple[str, str]]:
     """Return (artefact, text between its markers) of each quotation of a document."""
-    return [(found[1], found[2]) for found in BLOCK.finditer(text)]
+    return [(block[1], block[2]) for block in BLOCK.finditer(text)]
 
 
 def write_quotations(ledger: Ledger) -> list[str]:
@@ -89,29 +89,29 @@ def write_quotations(ledger: Ledger) -> list[str]:
 
 def documents() -> list[str]:
     """Return the documents that quote artefacts, each once."""
-    named = (name for artefact in declared_artefacts().values() for name in artefact.documents)
-    return list(dict.fromkeys(named))
+    names: dict[str, None] = {}
+    for artefact in declared_artefacts().values():
+        names |= dict.fromkeys(artefact.documents)
+    return list(names)
 
 
 def _rewritten(text: str, document: str, ledger: Ledger) -> str:
     """Return a document's text with what stands between markers as it is to be."""
 
-    def block(found: re.Match[str]) -> str:
-        name = found[1]
+    def rewritten_block(block: re.Match[str]) -> str:
+        name = block[1]
         inside = quotation(name, document, ledger)
         return f"<!-- artefact: {name} -->\n{inside}<!-- end: {name} -->"
 
-    return BLOCK.sub(block, text)
+    return BLOCK.sub(rewritten_block, text)
 
 
 def read_rows(name: str) -> list[Row]:
     """Return the stored rows of an artefact's table; numbers as float, texts as they stand."""
     path = provenance.ROOT / data_file(name)
     with path.open(encoding="utf-8", newline="") as stream:
-        return [
-            {column: _number(value) for column, value in row.items()}
-            for row in csv.DictReader(stream)
-        ]
+        texts = list(csv.DictReader(stream))
+    return [{column: _number(value) for column, value in row.items()} for row in texts]
 
 
 def stored_rows(table: QuotedTable, sources: Iterable[str]) -> str:
@@ -139,24 +139,25 @@ def _columns(table: QuotedTable) -> Iterable[str]:
     if table.across is not None:
         yield table.across.column
     for text in (*table.labels.values(), *table.cells.values(), table.absent):
-        yield from (field for _, field, _, _ in Formatter().parse(text) if field)
+        for _, column, _, _ in Formatter().parse(text):
+            if column:
+                yield column
 
 
 def table_text(table: QuotedTable, rows: Iterable[Row]) -> str:
     """Return a table in Markdown. Rows with equal labels are one row, in the order of the data."""
-    chosen = [row for row in rows if all(row[key] == value for key, value in table.where.items())]
+    chosen = [row for row in rows if _belongs(row, table)]
     by_labels: dict[tuple[str, ...], list[Row]] = {}
     for row in chosen:
         labels = tuple(_cell(text, row, table) for text in table.labels.values())
         by_labels.setdefault(labels, []).append(row)
     values = list(dict.fromkeys(_value_across(row, table) for row in chosen))
-    heads = [
-        *table.labels,
-        *(_head(cell, value, table) for value in values for cell in table.cells),
-    ]
+    heads = list(table.labels)
+    for value in values:
+        heads += [_head(cell, value, table) for cell in table.cells]
     lines = [_line(heads), "|" + "---|" * len(heads)]
-    for labels, together in by_labels.items():
-        by_value = {_value_across(row, table): row for row in together}
+    for labels, rows_with_labels in by_labels.items():
+        by_value = {_value_across(row, table): row for row in rows_with_labels}
         cells = [
             _cell(text, by_value.get(value, {}), table)
             for value in values
@@ -164,6 +165,11 @@ def table_text(table: QuotedTable, rows: Iterable[Row]) -> str:
         ]
         lines.append(_line([*labels, *cells]))
     return "\n".join(lines)
+
+
+def _belongs(row: Row, table: QuotedTable) -> bool:
+    """Return whether a table shows a row of its data."""
+    return all(row[column] == value for column, value in table.where.items())
 
 
 def _value_across(row: Row, table: QuotedTable) -> Any:
@@ -175,8 +181,8 @@ def _head(cell: str, value: Any, table: QuotedTable) -> str:
     """Return the head of a column: that of the cell, and that of the value along the table."""
     if table.across is None:
         return cell
-    along = table.across.head.format(value)
-    return f"{cell}, {along}" if cell else along
+    head_across = table.across.head.format(value)
+    return f"{cell}, {head_across}" if cell else head_across
 
 
 def _cell(text: str, row: Row, table: QuotedTable) -> str:
@@ -190,10 +196,12 @@ def _cell(text: str, row: Row, table: QuotedTable) -> str:
 
 
 def _line(cells: Iterable[str]) -> str:
+    """Return a row of a table in Markdown."""
     return f"| {' | '.join(cells)} |".replace("|  |", "| |")
 
 
 def _number(text: str) -> Any:
+    """Return a text as a number if it is one."""
     try:
         return float(text)
     except ValueError:
@@ -210,7 +218,8 @@ def _printed(command: str) -> str:
     """Return a command of tofpod with what it prints, as an indented block. Raises UserError if it
     fails."""
     words = [sys.executable, "-m", "harness", *shlex.split(command)[1:]]
-    done = subprocess.run(words, cwd=provenance.ROOT, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"{command}: fails: {done.stderr.strip()}")
-    return "".join(f"    {line}\n" for line in (f"$ {command}", *done.stdout.splitlines()))[:-1]
+    ended = subprocess.run(words, cwd=provenance.ROOT, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        raise UserError(f"{command}: fails: {ended.stderr.strip()}")
+    lines = [f"$ {command}", *ended.stdout.splitlines()]
+    return "\n".join(f"    {line}" for line in lines)

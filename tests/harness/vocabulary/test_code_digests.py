@@ -42,7 +42,11 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def forget() -> None:
-    for cached in (provenance.reached_sources, provenance._content, digests_module._of_source):
+    for cached in (
+        provenance.reached_sources,
+        provenance.first_content,
+        digests_module._syntax_digest,
+    ):
         cached.cache_clear()
 
 

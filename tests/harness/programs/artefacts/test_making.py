@@ -64,10 +64,10 @@ TABLE = """| camera | a90, frames: 1 | a90, frames: 50 |
 | Kinect v2 | 4.0 mm | none |"""
 CACHED = (
     declaration.declared_artefacts,
-    declaration._of_command,
-    provenance._content,
+    declaration._command_digests,
+    provenance.first_content,
     provenance.reached_sources,
-    digests_module._of_source,
+    digests_module._syntax_digest,
 )
 
 
