@@ -31,7 +31,8 @@ def experiment_digests(experiment: Experiment) -> Digests:
         several_views=any(source.views is not None for source in simulated),
     )
     settings = {key: value for key, value in experiment.data.items() if key not in NO_NUMBERS}
-    digests[f"{EXPERIMENT}{experiment.config.name}"] = digest(_stated(settings))[:DIGITS]
+    part = f"{EXPERIMENT}{experiment.config.name}"
+    digests[part] = digest(_without_empty(settings))[:DIGITS]
     return digests
 
 
@@ -45,19 +46,22 @@ def simulation_digests(
     kinds = {type(load_camera(name)).__module__.rpartition(".")[0] for name in names}
     unused = [room for room in KINDS if room.replace("/", ".") not in kinds]
     unused += ONLY_OF_CAPTURES
-    unused += () if several_views else ONLY_OF_SEVERAL_VIEWS
-    digests = {
-        room: value
-        for room, value in code_digests([*ROOTS, *modules]).items()
-        if not room.startswith(tuple(unused))
-    }
+    if not several_views:
+        unused += ONLY_OF_SEVERAL_VIEWS
+    digests = {}
+    for room, room_digest in code_digests([*ROOTS, *modules]).items():
+        if not room.startswith(tuple(unused)):
+            digests[room] = room_digest
     return digests | camera_digests(names)
 
 
 def camera_digests(names: Iterable[str]) -> Digests:
     """Return the digest of each camera's numbers, without their tags and sources."""
-    data = {name: _values(load_camera(name).to_data()) for name in sorted(names)}
-    return {f"camera {name}": digest(numbers)[:DIGITS] for name, numbers in data.items()}
+    digests = {}
+    for name in sorted(names):
+        numbers = _values(load_camera(name).to_data())
+        digests[f"camera {name}"] = digest(numbers)[:DIGITS]
+    return digests
 
 
 def _values(data: Any) -> Any:
@@ -67,13 +71,19 @@ def _values(data: Any) -> Any:
         if "value" in data and "source" in data:
             return data["value"]
         return {key: _values(value) for key, value in data.items() if key not in NO_NUMBERS}
-    return [_values(item) for item in data] if isinstance(data, list) else data
+    if isinstance(data, list):
+        return [_values(item) for item in data]
+    return data
 
 
-def _stated(data: Any) -> Any:
-    """Return a declaration without keys that are empty, so that a new key, of which nothing is
-    stated, changes no digest."""
+def _without_empty(data: Any) -> Any:
+    """Return a declaration without empty keys, so that a new key that an experiment does not use
+    changes no digest."""
     if not isinstance(data, Mapping):
         return data
-    stated = {key: _stated(value) for key, value in data.items()}
-    return {key: value for key, value in stated.items() if value not in (None, {}, [], ())}
+    filled = {}
+    for key, item in data.items():
+        value = _without_empty(item)
+        if value not in (None, {}, [], ()):
+            filled[key] = value
+    return filled

@@ -92,8 +92,8 @@ def _quick(data: Any) -> list[str]:
     overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
     overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
     # a third of the boards is too few to tell unknowns apart
-    has_both = shape.get(data, ("study",)) and shape.get(data, (UNKNOWNS,))
-    overrides += [f"{UNKNOWNS}=[]"] if has_both else []
+    if shape.get(data, ("study",)) and shape.get(data, (UNKNOWNS,)):
+        overrides.append(f"{UNKNOWNS}=[]")
     for path in ("repeats", "threshold.calibrate.repeats"):
         repeats = shape.get(data, tuple(path.split(".")))
         if isinstance(repeats, int):

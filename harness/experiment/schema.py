@@ -301,7 +301,7 @@ UNKNOWNS = "unknowns"
 STATED = "stated"
 DRAWN = "drawn"
 MAIN = "main"  # The set-up of an experiment without axes other than the number of frames
-NO_NUMBERS = (
+SHARED_BY_POINTS = (
     "name",
     "title",
     "repeats",
@@ -312,7 +312,7 @@ NO_NUMBERS = (
     "switches",
     "sensitivity",
 )
-"""Keys that determine which trials run, but not the result of any trial."""
+"""Keys that determine which trials run, but not the result of any trial: no point has its own."""
 
 
 @dataclass(frozen=True)
@@ -336,7 +336,10 @@ class Point:
 
     def with_unknowns(self, unknowns: tuple[UnknownConfig, ...], variant: str) -> Point:
         """Return the point whose boards differ in these unknowns, under another name."""
-        drawn = [[unknown.key, unknown.to_data()["values"], unknown.range] for unknown in unknowns]
+        drawn = []
+        for unknown in unknowns:
+            values = unknown.to_data()["values"]
+            drawn.append([unknown.key, values, unknown.range])
         return replace(
             self,
             label=f"{self.label}, {UNKNOWNS}={DRAWN}",
@@ -404,7 +407,7 @@ def point_of(
             "facts": digest(camera.to_data()),
         }
         frames |= {} if source.views is None else {"views": source.views.to_data()}
-    numbers = {key: value for key, value in config.to_data().items() if key not in NO_NUMBERS}
+    numbers = {key: value for key, value in config.to_data().items() if key not in SHARED_BY_POINTS}
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}

@@ -13,6 +13,7 @@ from harness.experiment import checks
 from harness.experiment.schema import (
     DRAWN,
     MAIN,
+    SHARED_BY_POINTS,
     STATED,
     UNKNOWNS,
     ExperimentConfig,
@@ -175,17 +176,6 @@ MAX_POINTS = 10_000
 MAX_SHOWN = 20
 FRAMES = "capture.frames"
 SWITCHES = "switches"  # Key of the file that states the path of a mapping of switches
-FIXED = (
-    "name",
-    "title",
-    "repeats",
-    "study",
-    "sweep",
-    "draws",
-    UNKNOWNS,
-    SWITCHES,
-    "sensitivity",
-)  # the same for all points
 
 
 @dataclass(frozen=True)
@@ -226,24 +216,22 @@ def unfolded(
     variations = list(_written_variations(source.data))
     unknowns = list(_written_unknowns(source.data))
     problems = [*_axis_problems(axes, source), *_variation_problems(variations, axes, source)]
-    for draft in {draft.settings[0].path: draft for draft in unknowns}.values():
-        position = source.place_of((*draft.named_at[:2], "key"))
-        problems += _path_problems(draft.settings[0].path, position, source, FIXED)
+    written_at_by_key = {draft.settings[0].path: draft.named_at for draft in unknowns}
+    for key, written_at in written_at_by_key.items():
+        position = source.place_of((*written_at[:2], "key"))
+        problems += _path_problems(key, position, source, SHARED_BY_POINTS)
     switches, mistakes = (
         _switch_axis(config, source) if config is not None and config.switches else ([], [])
     )
     problems += mistakes
-    for draft in (
-        *(Draft(_label([s]), "", (s,), s.written_at) for axis in axes for s in axis),
-        *unknowns,
-        *variations,
-    ):
-        if not any(
-            True
-            for setting in draft.settings
-            for _ in _path_problems(setting.path, None, source, FIXED)
-        ):
-            problems += _resolved(draft, source, config is not None)[1]
+    keep_all = config is not None
+    for axis in axes:
+        for setting in axis:
+            draft = Draft(_label([setting]), "", (setting,), setting.written_at)
+            problems += _draft_problems(draft, source, keep_all)
+    problems += _level_problems(unknowns, source, keep_all)
+    for variation in variations:
+        problems += _draft_problems(variation, source, keep_all)
     if problems or config is None:
         return (), problems
     axes = [switches, *axes] if switches else axes
@@ -255,6 +243,44 @@ def unfolded(
     if config.study is not None and config.unknowns:
         points = tuple(_stated_and_drawn(points, config))
     return points, problems
+
+
+def _draft_problems(draft: Draft, source: Source, keep_all: bool) -> list[Problem]:
+    """Return the problems of a draft whose paths are right; those of paths are reported at the
+    paths."""
+    for setting in draft.settings:
+        if any(_path_problems(setting.path, None, source, SHARED_BY_POINTS)):
+            return []
+    return _resolved(draft, source, keep_all)[1]
+
+
+def _level_problems(drafts: Iterable[Draft], source: Source, keep_all: bool) -> list[Problem]:
+    """Return the problems of the drafts of unknowns. One that all values of an unknown share, such
+    as a number that the camera lacks, is reported for the first value only."""
+    by_unknown: dict[KeyPath, list[dict[Problem, Problem]]] = {}
+    for draft in drafts:
+        lead = _lead(draft)
+        problems = {}
+        for problem in _draft_problems(draft, source, keep_all):
+            unlabelled = problem
+            if problem.message.startswith(lead):
+                message = problem.message.removeprefix(lead)
+                unlabelled = replace(problem, message=message, place=None)
+            problems[unlabelled] = problem
+        by_unknown.setdefault(draft.named_at[:2], []).append(problems)
+    reported = []
+    for problems_of_levels in by_unknown.values():
+        shared = set.intersection(*map(set, problems_of_levels))
+        for level, problems in enumerate(problems_of_levels):
+            for unlabelled, problem in problems.items():
+                if level == 0 or unlabelled not in shared:
+                    reported.append(problem)
+    return reported
+
+
+def _lead(draft: Draft) -> str:
+    """Return what begins a problem that does not lie at a draft's own value."""
+    return f"with {draft.label}: "
 
 
 def _written_unknowns(data: Any) -> Iterator[Draft]:
@@ -275,17 +301,18 @@ def _written_unknowns(data: Any) -> Iterator[Draft]:
 def _stated_and_drawn(points: Sequence[Point], config: ExperimentConfig) -> Iterator[Point]:
     """Yield the points of a study, and each of them again with its unknowns drawn for each board.
     An unknown that an axis sets is not drawn."""
-    unknowns = tuple(
-        unknown
-        for unknown in config.unknowns
-        if not any(is_same_fact(unknown.key, axis) for axis in config.sweep)
-    )
+    unknowns = []
+    for unknown in config.unknowns:
+        if not any(is_same_fact(unknown.key, axis) for axis in config.sweep):
+            unknowns.append(unknown)
     for point in points:
         yield replace(point, axes={**point.axes, UNKNOWNS: STATED})
-    for point in points if unknowns else ():
-        name = f"{UNKNOWNS}={DRAWN}"
+    if not unknowns:
+        return
+    name = f"{UNKNOWNS}={DRAWN}"
+    for point in points:
         variant = name if point.variant == MAIN else f"{point.variant}, {name}"
-        yield point.with_unknowns(unknowns, variant)
+        yield point.with_unknowns(tuple(unknowns), variant)
 
 
 def source_of(point: Point, purpose: str, number: int) -> SimulatedSource:
@@ -306,8 +333,9 @@ def stated_value(config: ExperimentConfig, key: str) -> Any:
     path = key_path(key)
     stated = shape.get(config.to_data(), path)
     if stated is None and path[: len(NUMBERS)] == NUMBERS:
-        facts = camera_of(config.simulated.camera).to_data()
-        stated = shape.get(facts, (*str(path[-1]).split("."), "value"))
+        camera_data = camera_of(config.simulated.camera).to_data()
+        number_path = str(path[-1]).split(".")
+        stated = shape.get(camera_data, (*number_path, "value"))
     return stated
 
 
@@ -356,7 +384,7 @@ def _axis_problems(axes: list[list[Setting]], source: Source) -> Iterator[Proble
     paths = [axis[0].path for axis in axes]
     for path in paths:
         position = source.key_place_of(("sweep", path))
-        yield from _path_problems(path, position, source, FIXED)
+        yield from _path_problems(path, position, source, SHARED_BY_POINTS)
         outer = next((prefix for prefix in paths if path.startswith(prefix + ".")), None)
         if outer:
             message = f"the axes `{outer}` and `{path}` set the same key"
@@ -425,7 +453,7 @@ def _variation_problems(
                 if "values" in setting.written_at
                 else source.key_place_of(setting.written_at)
             )
-            yield from _path_problems(setting.path, position, source, (*FIXED, FRAMES))
+            yield from _path_problems(setting.path, position, source, (*SHARED_BY_POINTS, FRAMES))
     # a variation needs a set-up of the main experiment with the same number of frames for
     # comparison
     main = [setting.value for axis in axes for setting in axis if setting.path == FRAMES]
@@ -479,7 +507,7 @@ def _resolved(
         for written_at, spot in written
         if any(written_at[: len(start)] == start for start in starts)
     }
-    elsewhere = f"with {draft.label}: " if draft.settings else ""
+    elsewhere = _lead(draft) if draft.settings else ""
     return config, [
         problem
         if problem.place in own_spots
@@ -505,8 +533,8 @@ def _drafts(
     chosen = list(product(*axes))
     if config.unknowns and config.study is None:
         chosen = [(*drawn, *settings) for drawn in _drawn_settings(config) for settings in chosen]
-        for drawn in chosen:
-            for setting in drawn:
+        for settings in chosen:
+            for setting in settings:
                 value = value_text(setting.path, setting.value)
                 texts.setdefault(id(setting), f"{names.get(setting.path)}={value}")
     elif config.draws is not None:
@@ -539,8 +567,8 @@ def _drawn_settings(config: ExperimentConfig) -> Iterator[tuple[Setting, ...]]:
     for number in range(config.draws or 0):
         settings = []
         for index, unknown in enumerate(config.unknowns):
-            value = unknown.drawn(config.seed, "set-up", number)
-            value = json.loads(json.dumps(value))  # lists, as in the file
+            drawn = unknown.drawn(config.seed, "set-up", number)
+            value = json.loads(json.dumps(drawn))  # lists, as in the file
             settings.append(Setting(unknown.key, value, (UNKNOWNS, index)))
         yield tuple(settings)
 

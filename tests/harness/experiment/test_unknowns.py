@@ -99,6 +99,18 @@ def test_what_cannot_be_unknown(tmp_path, unknown, expected):
     assert expected in str(refused.value)
 
 
+def test_a_problem_that_all_values_of_an_unknown_share_is_reported_once(tmp_path):
+    blur = "{key: source.camera.numbers.scatter.blur, range: [0.1, 0.2], reason: r}"
+    with pytest.raises(DeclarationError) as refused:
+        loaded(tmp_path, STUDY + f"unknowns: [{blur}]\n")
+    (problem,) = refused.value.problems
+    assert "scatter.blur=0.1" in problem.message
+    tilt = "{key: source.target.tilt_deg, range: [98.0, 99.0], reason: r}"
+    with pytest.raises(DeclarationError) as refused:
+        loaded(tmp_path, STUDY + f"unknowns: [{tilt}]\n")
+    assert len(refused.value.problems) == 2
+
+
 def test_unknowns_are_drawn_by_a_study_or_by_draws(tmp_path):
     unknown = "unknowns: [{key: source.target.distance_m, range: [0.6, 0.9], reason: r}]\n"
     with pytest.raises(DeclarationError) as refused:
