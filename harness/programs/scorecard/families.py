@@ -8,6 +8,7 @@ the logarithm of the condition."""
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -28,6 +29,7 @@ class FamilyScore:
     """A family and the scores of its figures."""
 
     family: Family
+    """The family, as the file declares it."""
     scores: Sequence[Score]
     """In the order of the family's figures."""
 
@@ -39,21 +41,26 @@ class FamilyScore:
     @cached_property
     def conditions(self) -> np.ndarray:
         """Values (n,) of the condition, in its unit."""
-        data = [score.figure.request.conditions.to_data() for score in self.scores]
-        return np.array([values[self.family.over] for values in data], float)
+        values = []
+        for score in self.scores:
+            conditions = score.figure.request.conditions.to_data()
+            values.append(conditions[self.family.over])
+        return np.array(values, float)
 
     @cached_property
     def log_conditions(self) -> np.ndarray:
         """Their logarithms (n,); of 1 / cos for an angle in degrees."""
         if self.family.over.endswith("_deg"):
-            return np.asarray(-np.log(np.cos(np.radians(self.conditions))))
+            cosines = np.cos(np.radians(self.conditions))
+            return np.asarray(-np.log(cosines))
         return np.log(self.conditions)
 
     @cached_property
     def log_ratios(self) -> np.ndarray:
         """Logarithms (n,) of simulated over published value; NaN without a simulated value."""
         ratios = np.array([score.ratio for score in self.scores])
-        return np.log(np.where(ratios > 0, ratios, np.nan))
+        positive = np.where(ratios > 0, ratios, np.nan)
+        return np.log(positive)
 
     @property
     def mean(self) -> float:
@@ -61,33 +68,47 @@ class FamilyScore:
         return float(np.exp(self.log_ratios.mean()))
 
     @cached_property
-    def slope(self) -> tuple[float, float]:
-        """Slope of the regression line, and half of its 95 % interval by Student's t."""
-        fitted = stats.linregress(self.log_conditions, self.log_ratios)
+    def line(self) -> Any:
+        """Regression line of the logarithms of ratios on those of conditions."""
+        return stats.linregress(self.log_conditions, self.log_ratios)
+
+    @property
+    def slope(self) -> float:
+        """Slope of the regression line."""
+        return float(self.line.slope)
+
+    @cached_property
+    def slope_half_width(self) -> float:
+        """Half of the slope's 95 % interval, by Student's t."""
         freedom = len(self.scores) - 2
-        return float(fitted.slope), float(stats.t.ppf(0.975, freedom) * fitted.stderr)
+        quantile = stats.t.ppf(0.975, freedom)
+        return float(quantile * self.line.stderr)
 
     @property
     def slope_interval(self) -> Interval:
         """The slope's 95 % interval."""
-        slope, half = self.slope
-        return Interval(slope - half, slope + half)
+        low = self.slope - self.slope_half_width
+        high = self.slope + self.slope_half_width
+        return Interval(low, high)
 
     @property
     def change(self) -> float:
         """Ratio at the greatest condition over that at the least, on the regression line."""
-        return float(np.exp(self.slope[0] * np.ptp(self.log_conditions)))
+        log_change = self.slope * np.ptp(self.log_conditions)
+        return float(np.exp(log_change))
 
     @property
     def has_trend(self) -> bool:
         """True if the slope's interval excludes 0 and the ratio changes by more than `OFF`."""
-        slope, half = self.slope
-        return bool(abs(slope) > half and abs(np.log(self.change)) > np.log(1 + OFF))
+        excludes_0 = abs(self.slope) > self.slope_half_width
+        changes = abs(np.log(self.change)) > np.log(1 + OFF)
+        return bool(excludes_0 and changes)
 
     @property
     def is_off(self) -> bool:
         """True unless the mean ratio lies within `OFF` of 1."""
-        return not abs(np.log(self.mean)) <= np.log(1 + OFF)
+        is_near_1 = abs(np.log(self.mean)) <= np.log(1 + OFF)
+        return not is_near_1
 
     @property
     def passes(self) -> bool:
@@ -109,7 +130,8 @@ class FamilyScore:
             faults.append("trend")
         if not faults:
             return "agrees"
-        return f"{' and '.join(faults)}{' (new)' if self.fell_behind else ''}"
+        verdict = " and ".join(faults)
+        return f"{verdict} (new)" if self.fell_behind else verdict
 
 
 def family_scores(families: Sequence[Family], scores: Sequence[Score]) -> list[FamilyScore]:
@@ -123,7 +145,8 @@ def family_scores(families: Sequence[Family], scores: Sequence[Score]) -> list[F
 
 
 def _span(row: FamilyScore) -> str:
-    least, greatest = row.conditions.min(), row.conditions.max()
+    least = row.conditions.min()
+    greatest = row.conditions.max()
     return f"{row.family.over} {least:g} to {greatest:g}"
 
 
@@ -143,7 +166,7 @@ FAMILIES = Table(
         Column("over", "over", _span, "the condition and its ends"),
         Column("figures", "figures", lambda row: len(row.scores), "number of figures"),
         Column("mean", "mean ratio", "mean", "geometric mean of the ratios", number),
-        Column("slope", "slope", lambda row: row.slope[0], "of log ratio on log condition", number),
+        Column("slope", "slope", "slope", "of log ratio on log condition", number),
         Column("slope_low", "", "slope_interval.low", "lower end of its 95 % interval"),
         Column("slope_high", "", "slope_interval.high", "upper end of its 95 % interval"),
         Column("change", "last / first", "change", "change of the ratio along the family", number),

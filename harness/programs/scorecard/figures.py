@@ -178,7 +178,8 @@ def _problem_of(family: Family, figures: Mapping[str, Figure]) -> str:
     if unknown:
         return f"the family {family.name} names no figure of the file: {', '.join(unknown)}"
     members = [figures[name] for name in family.figures]
-    if len({(figure.camera, figure.quantity, figure.use) for figure in members}) > 1:
+    kinds = {(figure.camera, figure.quantity, figure.use) for figure in members}
+    if len(kinds) > 1:
         return f"the family {family.name} mixes cameras, quantities or uses"
     if any(not figure.published.value for figure in members):
         return f"the family {family.name} has a figure without a value, or with the value 0"
@@ -230,8 +231,10 @@ def read_figures(path: Path = FIGURES_FILE) -> FiguresFile:
         raise DeclarationError(str(path), [*problems, *declared])
     by_name = {figure.name: figure for figure in file.figures}
     for number, family in enumerate(file.families):
-        if fault := _problem_of(family, by_name):
-            problems.append(Problem(fault, source.place_of(("families", number, "figures"))))
+        fault = _problem_of(family, by_name)
+        if fault:
+            position = source.place_of(("families", number, "figures"))
+            problems.append(Problem(fault, position))
     if problems:
         raise DeclarationError(str(path), problems)
     return file
@@ -398,7 +401,9 @@ def _named(score: Score) -> str:
 
 
 def _yes_or_no(strict: bool | None) -> str:
-    return {True: "yes", False: "no", None: "–"}[strict]
+    if strict is None:
+        return "–"
+    return "yes" if strict else "no"
 
 
 def _remarks(score: Score) -> str:

@@ -97,18 +97,21 @@ class Constant:
     def _stepped(self, upwards: bool, step: float) -> Any:
         """Return the value after a share ``step`` of the whole way."""
         if isinstance(self.value, tuple):
-            return tuple(self._one_stepped(value, upwards, step) for value in self.value)
-        return self._one_stepped(self.value, upwards, step)
+            return tuple(self._number_stepped(number, upwards, step) for number in self.value)
+        return self._number_stepped(self.value, upwards, step)
 
-    def _one_stepped(self, value: float, upwards: bool, step: float) -> float:
-        end = value * (1 + SHARE if upwards else 1 - SHARE)
+    def _number_stepped(self, number: float, upwards: bool, step: float) -> float:
+        """Return a number of the value after the step; whole numbers stay whole."""
+        factor = 1 + SHARE if upwards else 1 - SHARE
+        end = number * factor
         if self.limits is not None:
             end = self.limits[upwards]
-        stepped = value + step * (end - value)
-        return round(stepped) if isinstance(value, int) else stepped
+        stepped = number + step * (end - number)
+        return round(stepped) if isinstance(number, int) else stepped
 
 
 def _is_legal(camera: str, key: str, value: Any) -> bool:
+    """Return whether a camera accepts a value of a constant."""
     try:
         camera_of(CameraConfig(name=camera, numbers={key: value}))
     except UserError:
@@ -144,10 +147,10 @@ def _fact(data: Mapping[str, Any], key: str) -> dict[str, Any] | None:
 
 def _numbers(value: Any) -> Any:
     """Return a number, or a tuple of numbers; None for anything else."""
-    values = value if isinstance(value, list) else [value]
-    if not values or any(isinstance(one, bool) for one in values):
+    numbers = value if isinstance(value, list) else [value]
+    if not numbers or any(isinstance(number, bool) for number in numbers):
         return None
-    if not all(isinstance(one, int | float) for one in values):
+    if not all(isinstance(number, int | float) for number in numbers):
         return None
     return tuple(value) if isinstance(value, list) else value
 
@@ -157,6 +160,7 @@ class Moved:
     """A constant, moved both ways, and what notices it."""
 
     constant: Constant
+    """The constant, with the value in its file."""
     lowered: Any
     """The value after the move down; None if no lower value is legal."""
     raised: Any
@@ -189,8 +193,11 @@ class _Move:
     """A constant with another value, and the blind figures of the cameras that use it."""
 
     constant: Constant
+    """The constant that is moved."""
     value: Any
+    """Its value after the move."""
     figures: tuple[Figure, ...]
+    """The figures that may notice it."""
 
     def requests(self) -> list[Request]:
         """Return the measurements of the figures with the moved constant."""
@@ -208,27 +215,30 @@ class _Move:
         ]
         names = []
         for old, new in zip(before, after, strict=True):
-            if _differ(old, new):
+            if _is_noticed(old, new):
                 names.append(new.figure.name)
         old_families = family_scores(families, before)
         new_families = family_scores(families, after)
         for old_family, new_family in zip(old_families, new_families, strict=True):
-            moved = [
+            log_changes = [
                 abs(np.log(new_family.mean / old_family.mean)),
                 abs(np.log(new_family.change / old_family.change)),
             ]
-            if old_family.verdict != new_family.verdict and max(moved) > LEAST_CHANGE:
+            has_other_verdict = old_family.verdict != new_family.verdict
+            if has_other_verdict and max(log_changes) > LEAST_CHANGE:
                 names.append(new_family.family.name)
         return tuple(names)
 
 
-def _differ(old: Score, new: Score) -> bool:
-    """Return whether a figure's grade changes, and its value by more than noise does."""
-    old_value, new_value = old.simulated.value, new.simulated.value
+def _is_noticed(old: Score, new: Score) -> bool:
+    """Return whether a figure's grade changes, and its value by more than noise changes it."""
+    old_value = old.simulated.value
+    new_value = new.simulated.value
     if np.isnan(old_value) or np.isnan(new_value):
         return bool(np.isnan(old_value) != np.isnan(new_value))
     change = abs(new_value - old_value)
-    return old.grade != new.grade and change > LEAST_CHANGE * abs(old_value)
+    is_evident = change > LEAST_CHANGE * abs(old_value)
+    return old.grade != new.grade and is_evident
 
 
 def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved]:
@@ -244,16 +254,17 @@ def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved
     noticed: dict[tuple[Constant, bool], tuple[str, ...]] = dict.fromkeys(moves, ())
     readings: dict[Request, Reading] = {}
     for is_own in (True, False):
-        asked = {}
+        tried = {}
         for (constant, upwards), value in moves.items():
             is_noticed = noticed[constant, False] or noticed[constant, True]
             if value is not None and not is_noticed:
                 figures = _figures(file, constant, owners, is_own)
-                asked[constant, upwards] = _Move(constant, value, figures)
-        requests = {request for move in asked.values() for request in move.requests()}
+                tried[constant, upwards] = _Move(constant, value, figures)
+        requests = {request for move in tried.values() for request in move.requests()}
         requests |= {request._replace(numbers=()) for request in requests}
-        readings |= measured(sorted(requests - readings.keys(), key=repr), BRIEF, jobs)
-        for key, move in asked.items():
+        missing = sorted(requests - readings.keys(), key=repr)
+        readings |= measured(missing, BRIEF, jobs)
+        for key, move in tried.items():
             noticed[key] = move.noticed(file.families, readings)
     return [
         Moved(
@@ -274,7 +285,8 @@ def _figures(
     cameras that inherit it. ``owners``: by camera, who states each number."""
     figures = []
     for figure in file.figures:
-        if figure.use != "blind" or (figure.camera == constant.camera) != is_own:
+        is_of_camera = figure.camera == constant.camera
+        if figure.use != "blind" or is_of_camera != is_own:
             continue
         uses = owners.get(figure.camera, {}).get(constant.key) == constant.camera
         if uses and _acts(constant.key, figure.measures):
@@ -317,17 +329,20 @@ def stored_untested(cameras: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _value_text(value: Any) -> str:
+    """Return a constant's value; a dash for a move that no legal value allows."""
     if value is None:
         return "–"
-    values = value if isinstance(value, tuple) else (value,)
-    return ", ".join(f"{one:.4g}" for one in values)
+    numbers = value if isinstance(value, tuple) else (value,)
+    return ", ".join(f"{number:.4g}" for number in numbers)
 
 
 def _names_text(names: tuple[str, ...]) -> str:
+    """Return all names, for the table in a file."""
     return ", ".join(names) or "–"
 
 
 def _names_brief(names: tuple[str, ...]) -> str:
+    """Return the first name and the number of others, for a narrow table."""
     if len(names) < 2:
         return _names_text(names)
     return f"{names[0]} and {len(names) - 1} more"

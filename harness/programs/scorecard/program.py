@@ -156,14 +156,16 @@ def _compare_untested(moved: Sequence[power.Moved], cameras: Sequence[str], out:
     stored = power.stored_untested(cameras)
     if keys == stored:
         return True
-    write_text(out / power.UNTESTED_FILE.name, power.untested_text(keys))
+    file_name = power.UNTESTED_FILE.name
+    write_text(out / file_name, power.untested_text(keys))
     for camera in cameras:
-        for key in sorted(set(keys.get(camera, [])) ^ set(stored.get(camera, []))):
-            state = "untested" if key in keys.get(camera, []) else "noticed"
+        untested_keys = set(keys.get(camera, []))
+        stored_keys = set(stored.get(camera, []))
+        for key in sorted(untested_keys ^ stored_keys):
+            state = "untested" if key in untested_keys else "noticed"
             print(f"{camera}: {key} is {state} now", file=sys.stderr)
     print(
-        f"the untested constants are not those of {power.UNTESTED_FILE.name}: see "
-        f"{out / power.UNTESTED_FILE.name}",
+        f"the untested constants are not those of {file_name}: see {out / file_name}",
         file=sys.stderr,
     )
     return False
@@ -311,7 +313,8 @@ def _power_answer(moved: Sequence[power.Moved]) -> list[str]:
     if not movable:
         return []
     noticed = sum(bool(row.names) for row in movable)
+    immovable = len(moved) - len(movable)
     return [
         f"{noticed} of {len(movable)} constants are noticed when they are moved; "
-        f"{len(moved) - len(movable)} could not be moved."
+        f"{immovable} could not be moved."
     ]

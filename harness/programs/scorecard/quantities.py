@@ -144,10 +144,11 @@ class StepConditions(Config):
 
     @model_validator(mode="after")
     def _shadow_has_surroundings(self) -> Self:
-        is_complete = self.front_mm is not None and self.back_albedo is not None
-        if self.shadow and not is_complete:
+        has_front = self.front_mm is not None
+        has_back = self.back_albedo is not None
+        if self.shadow and not (has_front and has_back):
             raise ValueError("a shadow needs front_mm and back_albedo: its light is rendered")
-        if not self.shadow and (self.front_mm is not None or self.back_albedo is not None):
+        if not self.shadow and (has_front or has_back):
             raise ValueError("front_mm and back_albedo belong to a shadow")
         return self
 
@@ -305,8 +306,13 @@ def frame_jitter_mm(bench: Bench, c: PlaneConditions) -> Reading:
     """Standard deviation over frames of the mean z of 25,000 pixels, without frames that jumped."""
     stack = plane_stack(bench, c, EffectsConfig(), patch=PATTERN_PATCH)
     means_m = np.nanmean(stack.z_m, axis=(1, 2))
-    steady_m = means_m[np.abs(means_m - np.median(means_m)) < JUMP_M]
-    return jackknifed(steady_m, lambda means: float(means.std(ddof=1)) / MM)
+    from_median_m = np.abs(means_m - np.median(means_m))
+    steady_m = means_m[from_median_m < JUMP_M]
+
+    def deviation_mm(steady: np.ndarray) -> float:
+        return float(steady.std(ddof=1)) / MM
+
+    return jackknifed(steady_m, deviation_mm)
 
 
 @_quantity("noise correlation", LagConditions)
@@ -333,10 +339,12 @@ def least_range_mm(bench: Bench, c: NearConditions) -> Reading:
         plane = PlaneConditions(distance_m=distance_m, **c.to_data())
         return valid_fraction(bench, plane).value >= IN_RANGE
 
-    far_m = max(bench.camera.optics.nearest_m, NEAREST_M)
+    optics = bench.camera.optics
+    far_m = max(optics.nearest_m, NEAREST_M)
+    farthest_m = min(optics.farthest_m, FARTHEST_M)
     while not in_range(far_m):
         far_m *= STEP_OUT
-        if far_m > min(bench.camera.optics.farthest_m, FARTHEST_M):
+        if far_m > farthest_m:
             return Reading(float("nan"))
     near_m = far_m / STEP_OUT
     for _ in range(HALVINGS):

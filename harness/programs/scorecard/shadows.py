@@ -49,6 +49,7 @@ def rendered_step(
     if axis == 1:
         away = away[::-1]
         turn = -turn
+    # the edge passes the axis, half a side from the centre
     centre_mm = -sign * front_mm / 2 * away
     target = TargetConfig(
         board=BoardConfig(

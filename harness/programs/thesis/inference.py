@@ -63,7 +63,7 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
     relative = np.exp(log_likelihood - log_likelihood.max())
     share = relative / relative.sum()
     set_ups = rows.drop_duplicates("variant").set_index("variant")
-    values = sum(len(_values(path, set_ups[path])) for path in axes)
+    value_count = sum(len(_values(path, set_ups[path])) for path in axes)
     posterior: list[dict[str, Any]] = [
         {
             "axis": SET_UP,
@@ -84,14 +84,16 @@ def posterior_of(summary: pd.DataFrame, axes: Sequence[str]) -> pd.DataFrame | N
             name = f"{name} of {kind} holes"
         for value, has_value in _values(path, possible[path]).items():
             group = possible.index[has_value]
-            interval = _interval(relative[possible.index].to_numpy(), has_value, values)
+            relative_of_possible = relative[possible.index].to_numpy()
+            interval = _interval(relative_of_possible, has_value, value_count)
+            posterior_share = share[group].sum() / share[possible.index].sum()
             posterior.append(
                 {
                     "axis": name,
                     "value": value,
                     "prior_share": len(group) / len(possible),
                     "likelihood": float(np.exp(log_likelihood[group]).mean()),
-                    "posterior_share": float(share[group].sum() / share[possible.index].sum()),
+                    "posterior_share": float(posterior_share),
                     "posterior_low": interval.low,
                     "posterior_high": interval.high,
                 }
@@ -103,30 +105,34 @@ def _values(path: str, column: pd.Series) -> dict[str, np.ndarray]:
     """Return the values of an axis in words, in ascending order, each with which set-ups (n,) have
     it; of a range, its parts."""
     values = column.drop_duplicates().sort_values()
+    has_value: dict[str, np.ndarray] = {}
     if len(values) <= MOST_VALUES:
-        return {
-            "none" if pd.isna(value) else value_text(path, value): np.asarray(
-                column.isna() if pd.isna(value) else column == value
-            )
-            for value in values
-        }
+        for value in values:
+            if pd.isna(value):
+                has_value["none"] = np.asarray(column.isna())
+            else:
+                has_value[value_text(path, value)] = np.asarray(column == value)
+        return has_value
     edges = np.linspace(values.min(), values.max(), PARTS + 1)
     part = np.minimum(np.digitize(column, edges), PARTS) - 1
-    words = {}
     for number in range(PARTS):
         ends = f"{edges[number]:.2g} to {edges[number + 1]:.2g} {unit_of(path)}"
-        words[ends.rstrip()] = part == number
-    return words
+        has_value[ends.rstrip()] = part == number
+    return has_value
 
 
-def _interval(relative: np.ndarray, has_value: np.ndarray, values: int) -> Interval:
+def _interval(relative: np.ndarray, has_value: np.ndarray, value_count: int) -> Interval:
     """Return the interval of a value's posterior share over resampled set-ups, from their relative
-    likelihoods (n,) and which of them (n,) have the value: one that holds for all of so many
-    ``values`` at 95 %."""
-    stream = random_stream(0, "set-ups drawn again", len(relative))
-    times = stream.multinomial(len(relative), np.full(len(relative), 1 / len(relative)), RESAMPLES)
-    shares = (times @ (relative * has_value)) / (times @ relative)
-    return percentiles(shares, 1 - (1 - CONFIDENCE) / values)
+    likelihoods (n,) and which of them (n,) have the value. All ``value_count`` intervals hold at
+    once with a confidence of 95 %."""
+    count = len(relative)
+    stream = random_stream(0, "set-ups drawn again", count)
+    equal = np.full(count, 1 / count)
+    times_drawn = stream.multinomial(count, equal, RESAMPLES)
+    sums_with_value = times_drawn @ (relative * has_value)
+    sums = times_drawn @ relative
+    confidence = 1 - (1 - CONFIDENCE) / value_count
+    return percentiles(sums_with_value / sums, confidence)
 
 
 def _log_likelihood(rows: pd.DataFrame) -> pd.Series:
@@ -146,10 +152,11 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
     """Return what the thesis' result decides and what it does not: the values of each axis that it
     makes doubtful (without facts of a doubtful kind of hole), and the axes that have none."""
     is_set_up = posterior["axis"] == SET_UP
-    is_doubted = posterior["posterior_share"] < DOUBTED * posterior["prior_share"]
-    is_doubted &= posterior["posterior_high"] < posterior["prior_share"]
+    prior = posterior["prior_share"]
+    is_doubted = posterior["posterior_share"] < DOUBTED * prior
+    is_doubted &= posterior["posterior_high"] < prior
     doubted_values = posterior["value"][is_doubted & ~is_set_up]
-    against = []
+    doubtful = []
     undecided = []
     for name, rows in posterior[~is_set_up].groupby("axis", sort=False):
         if any(str(name).endswith(f" of {value} holes") for value in doubted_values):
@@ -158,9 +165,11 @@ def borne_out_if(posterior: pd.DataFrame) -> str:
         if doubted.empty:
             undecided.append(str(name))
         else:
-            against.append(f"{name} of {' or '.join(doubted['value'])}")
-    decides = f"speaks against {'; '.join(against)}" if against else "speaks against nothing"
-    leaves = f"does not decide {', '.join(undecided)}" if undecided else "leaves nothing open"
+            doubtful.append(f"{name} of {' or '.join(doubted['value'])}")
+    decides = f"speaks against {'; '.join(doubtful) or 'nothing'}"
+    leaves = "leaves nothing open"
+    if undecided:
+        leaves = f"does not decide {', '.join(undecided)}"
     likeliest = posterior.iloc[0]
     return (
         f"Of what the thesis leaves open, its outcome {decides}, and {leaves} (a value is doubtful "

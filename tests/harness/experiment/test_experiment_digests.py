@@ -60,6 +60,8 @@ def test_a_cameras_number_counts_and_its_source_does_not(monkeypatch):
 
 def test_a_new_key_without_a_value_changes_nothing():
     without_empty = digests_module._without_empty
-    assert without_empty({"a": 1, "b": {"c": None, "d": []}}) == without_empty({"a": 1, "unknowns": []})
+    assert without_empty({"a": 1, "b": {"c": None, "d": []}}) == without_empty(
+        {"a": 1, "unknowns": []}
+    )
     assert without_empty({"a": 0}) == {"a": 0}
     assert without_empty({"a": False}) == {"a": False}

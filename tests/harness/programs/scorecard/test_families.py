@@ -59,8 +59,8 @@ def family_of(folder: Path, ratios: list[float], text: str = "") -> FamilyScore:
 def test_the_slope_is_that_of_a_power_law(tmp_path: Path) -> None:
     """Ratios 0.9 x^0.1: from 1 to 8 m the ratio grows by 8^0.1 = 1.231."""
     family = family_of(tmp_path, [0.9 * metres**0.1 for metres in DISTANCES])
-    assert family.slope[0] == pytest.approx(0.1)
-    assert family.slope[1] == pytest.approx(0.0, abs=1e-6)
+    assert family.slope == pytest.approx(0.1)
+    assert family.slope_half_width == pytest.approx(0.0, abs=1e-6)
     assert family.change == pytest.approx(8**0.1)
     assert family.mean == pytest.approx(0.9 * 8 ** (0.1 / 2))
     assert family.has_trend
@@ -75,15 +75,15 @@ def test_the_interval_is_students(tmp_path: Path) -> None:
     family = family_of(tmp_path, np.exp([d, -d, -d, d]).tolist())
     spread = np.log(2) * np.sqrt(5.0)
     error = np.sqrt(4 * d**2 / 2) / spread
-    assert family.slope[0] == pytest.approx(0.0, abs=1e-12)
-    assert family.slope[1] == pytest.approx(4.3027 * error, rel=1e-4)
+    assert family.slope == pytest.approx(0.0, abs=1e-12)
+    assert family.slope_half_width == pytest.approx(4.3027 * error, rel=1e-4)
     assert family.verdict == "agrees"
-    assert family.slope_interval.low == pytest.approx(-family.slope[1])
+    assert family.slope_interval.low == pytest.approx(-family.slope_half_width)
 
 
 def test_a_small_or_uncertain_slope_is_no_trend(tmp_path: Path) -> None:
     small = family_of(tmp_path, [metres**0.04 / 1.05 for metres in DISTANCES])
-    assert abs(small.slope[0]) > small.slope[1]
+    assert abs(small.slope) > small.slope_half_width
     assert small.change == pytest.approx(8**0.04)  # 1.087
     assert small.verdict == "agrees"
     uncertain = family_of(tmp_path, [0.8, 1.2, 0.85, 1.25])
@@ -116,7 +116,7 @@ def test_a_value_that_is_missing_makes_the_family_off(tmp_path: Path) -> None:
 def test_an_angle_counts_by_the_inverse_of_its_cosine(tmp_path: Path) -> None:
     text = text_of((0, 60, 45, 30)).replace("over: distance_m", "over: angle_deg")
     family = family_of(tmp_path, [1.0, 2.0**0.5, 2.0**0.25, (4 / 3) ** 0.25], text)
-    assert family.slope[0] == pytest.approx(0.5)
+    assert family.slope == pytest.approx(0.5)
 
 
 def test_a_family_is_judged_only_if_all_its_figures_were_scored(tmp_path: Path) -> None:
