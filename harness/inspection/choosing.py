@@ -200,13 +200,14 @@ def _rank(name: str, reach_px: float) -> int:
     return order.index(name)
 
 
-def _is_better(found: np.ndarray, by_other: np.ndarray) -> bool:
+def _is_better(by_first: np.ndarray, by_second: np.ndarray) -> bool:
     """Return whether the first finds more of the holes (n,) than chance explains by `CHANCE`
     deviations: among holes that only one of them finds, each has half with a deviation of half the
     root of their number."""
-    only = int((found & ~by_other).sum())
-    other_only = int((by_other & ~found).sum())
-    return only - other_only > CHANCE * np.sqrt(only + other_only)
+    only_first = int((by_first & ~by_second).sum())
+    only_second = int((by_second & ~by_first).sum())
+    deviation = np.sqrt(only_first + only_second)
+    return bool(only_first - only_second > CHANCE * deviation)
 
 
 def _reason(name: str, sought: _Sought, calls: str, pixels: str) -> str:

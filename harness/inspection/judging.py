@@ -49,13 +49,13 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     )
     joints = joints_of(cloud, evidence, detections, measurements)
     if joints:
-        further: list[TouchingDamage] = []
+        touching: list[TouchingDamage] = []
         for feature in joints:
-            further += damage_beside(cloud, evidence, detections, measurements, feature)
-        joints = tuple(without_damage(feature, further) for feature in joints)
-        detections += tuple(part.detection for part in further)
+            touching += damage_beside(cloud, evidence, detections, measurements, feature)
+        joints = tuple(without_damage(feature, touching) for feature in joints)
+        detections += tuple(damage.detection for damage in touching)
         measurements += tuple(
-            _measured(detector, cloud, part.evidence, part.detection) for part in further
+            _measured(detector, cloud, damage.evidence, damage.detection) for damage in touching
         )
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)

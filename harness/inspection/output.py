@@ -63,8 +63,9 @@ def print_capture(
         )
         pixels = f"{cloud.noise_reach_px:.0f}"
         if cloud.noise_sides_px is not None:
-            least_px = float(cloud.noise_sides_px.min())
-            pixels = f"{least_px:.0f} to {cloud.noise_sides_px.max():.0f}"
+            least_px = cloud.noise_sides_px.min()
+            most_px = cloud.noise_sides_px.max()
+            pixels = f"{least_px:.0f} to {most_px:.0f}"
             why += " at each place"
         print(f"note: {pixels} pixels share their noise: {why}")
     for left_out in cloud.left_out:

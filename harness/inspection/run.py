@@ -33,7 +33,7 @@ from harness.inspection.verdict import (
     FLAGS,
     InspectionVerdict,
     calls_text,
-    known_areas_m2,
+    filled_areas_m2,
     verdict_of,
 )
 from harness.records import outputs
@@ -252,7 +252,7 @@ def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evi
     if choice is None or choice.part is None:
         return evidence
     fit = str(evidence.notes.get("shape", evidence.notes.get("surface", "")))
-    pixel_m2, _ = known_areas_m2(cloud, evidence)
+    pixel_m2, _ = filled_areas_m2(cloud, evidence)
     pieces = piece_facts(choice.part, pixel_m2, evidence.residual_m, fit)
     return replace(evidence, notes={**evidence.notes, "pieces": pieces})
 

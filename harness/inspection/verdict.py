@@ -16,6 +16,7 @@ from detectors.pixels.masks import holes_filled
 from detectors.pixels.noise import noise_sides_at
 from harness.report.findings import Finding, Judged, Remark
 from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.text import joined_words
 
 SURE = "sure"
 DOUBTFUL = "doubtful"
@@ -156,19 +157,21 @@ def _cut_by_the_rim(
     it may not have been seen. All False without a pixel grid."""
     if not cloud.organised:
         return (False,) * len(detections)
+    is_judged = holes_filled(np.isfinite(evidence.residual_m))
     # the picture's own edge is a rim too
-    inside = np.pad(holes_filled(np.isfinite(evidence.residual_m)), 1)
-    depths_px = ndimage.distance_transform_edt(inside)[1:-1, 1:-1].ravel()
+    padded = np.pad(is_judged, 1)
+    depths_px = ndimage.distance_transform_edt(padded)[1:-1, 1:-1].ravel()
     return tuple(_is_cut(cloud, detection, depths_px) for detection in detections)
 
 
 def _is_cut(cloud: Cloud, detection: Detection, depths_px: np.ndarray) -> bool:
     """Return whether a detection's pixel that is nearest to the rim lies within half of the blur
     there. ``depths_px``: flat, distance of each pixel to the rim, 1 for those along it."""
-    nearest = int(detection.pixels[np.argmin(depths_px[detection.pixels])])
-    row, column = divmod(nearest, cloud.points_m.shape[1])
-    half_px = 0.5 * max(noise_sides_at(cloud, row, column))
-    return bool(depths_px[nearest] <= max(half_px, RIM_DEPTH_PX))
+    depths_of_detection_px = depths_px[detection.pixels]
+    outermost = int(detection.pixels[np.argmin(depths_of_detection_px)])
+    row, column = divmod(outermost, cloud.points_m.shape[1])
+    half_blur_px = 0.5 * max(noise_sides_at(cloud, row, column))
+    return bool(depths_px[outermost] <= max(half_blur_px, RIM_DEPTH_PX))
 
 
 # ---------------------------------------------------------------- what was judged
@@ -189,9 +192,9 @@ class Extent:
 def extent_of(result: Judged, outline: np.ndarray | None) -> Extent:
     """Return how much was judged. ``outline`` (h, w) bool: the part, or None if it was not sought;
     then the outline of the judged area takes its place."""
-    known_m2, typical_m2 = known_areas_m2(result.cloud, result.evidence)
+    areas_m2, typical_m2 = filled_areas_m2(result.cloud, result.evidence)
     is_judged = np.isfinite(result.evidence.residual_m)
-    judged_m2 = float(known_m2[is_judged].sum())
+    judged_m2 = float(areas_m2[is_judged].sum())
     part = outline
     if part is None and result.missing is not None:
         part = result.missing.outline
@@ -201,13 +204,17 @@ def extent_of(result: Judged, outline: np.ndarray | None) -> Extent:
     return Extent(judged_m2, share, _blind_m2(result.missing, typical_m2))
 
 
-def known_areas_m2(cloud: Cloud, evidence: Evidence) -> tuple[np.ndarray, float]:
-    """Return (h, w): the area of the surface that each pixel sees, and that of a typical judged
-    pixel, which stands for pixels where the surface is not known; NaN if nothing is judged."""
+def filled_areas_m2(cloud: Cloud, evidence: Evidence) -> tuple[np.ndarray, float]:
+    """Return the area of the surface that each pixel sees, and the median over judged pixels, which
+    stands for pixels where the surface is not known; NaN if nothing is judged."""
     areas_m2 = pixel_areas_m2(cloud, evidence.surface_z_m)
-    is_known = np.isfinite(areas_m2) & np.isfinite(evidence.residual_m)
-    typical_m2 = float(np.median(areas_m2[is_known])) if is_known.any() else math.nan
-    return np.where(np.isfinite(areas_m2), areas_m2, typical_m2), typical_m2
+    has_area = np.isfinite(areas_m2)
+    areas_of_judged_m2 = areas_m2[has_area & np.isfinite(evidence.residual_m)]
+    typical_m2 = math.nan
+    if areas_of_judged_m2.size:
+        typical_m2 = float(np.median(areas_of_judged_m2))
+    filled_m2 = np.where(has_area, areas_m2, typical_m2)
+    return filled_m2, typical_m2
 
 
 def _blind_m2(missing: MissingReturns | None, pixel_m2: float) -> float:
@@ -391,13 +398,6 @@ def counted_text(count: int, term: str) -> str:
     return f"{word} {name}"
 
 
-def joined_words(parts: Sequence[str]) -> str:
-    """Return ``a``, ``a and b``, or ``a, b and c``."""
-    if len(parts) < 2:
-        return "".join(parts)
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
 def extent_text(extent: Extent) -> str:
     """Return ``0.12 m2, 97 % of ``, with as much as is known of how much was judged; empty where
     nothing is."""
@@ -447,7 +447,8 @@ def _joints_clauses(joints: Sequence[dict[str, Any]]) -> list[str]:
     for facts in joints:
         size = f"{facts['length_mm']:.0f} x {facts['width_mm']:.0f} mm"
         differing = facts["differing"]
-        clause = f"{facts['count'] + differing} joints of {size} in rows, "
+        count = facts["count"] + differing
+        clause = f"{count} joints of {size} in rows, "
         if not differing:
             clause += "all alike"
         else:

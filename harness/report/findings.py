@@ -575,10 +575,9 @@ def parts_of(cloud: Cloud, detection: Detection) -> list[Detection]:
 
 def _circles(axes: Axes, cloud: Cloud, number: int, detection: Detection) -> None:
     """Draw a circle around each part of a finding, with its number beside the first."""
-    first, *further = parts_of(cloud, detection)
-    _circle(axes, cloud, str(number), first)
-    for part in further:
-        _circle(axes, cloud, "", part)
+    for index, part in enumerate(parts_of(cloud, detection)):
+        label = str(number) if index == 0 else ""
+        _circle(axes, cloud, label, part)
 
 
 def _circle(axes: Axes, cloud: Cloud, label: str, detection: Detection) -> None:

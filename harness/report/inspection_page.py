@@ -194,10 +194,11 @@ def numbered_picture(judged: Judged, picture: Picture, name: str) -> Markup:
     font = share * max(width, height)
     marks = []
     for finding, detection in zip(findings, judged.detections, strict=True):
-        first, *further = parts_of(judged.cloud, detection)
-        marks.append(_mark(judged.cloud, picture, finding, first, font=font))
-        for part in further:
-            marks.append({**_mark(judged.cloud, picture, finding, part, font=font), "id": ""})
+        for index, part in enumerate(parts_of(judged.cloud, detection)):
+            mark = _mark(judged.cloud, picture, finding, part, font=font)
+            if index > 0:
+                mark["id"] = ""
+            marks.append(mark)
     return Markup(
         template("findings.svg").render(
             width=width,

@@ -51,8 +51,9 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     if notes:
         parts += ["", *notes]
     headline = unknown_headline(result)
-    others = [text for text in unknown_sentences(result) if text != headline]
-    parts += ["", *others] if others else []
+    sentences = [sentence for sentence in unknown_sentences(result) if sentence != headline]
+    if sentences:
+        parts += ["", *sentences]
     return [*parts, "", " ".join(_answers(result))]
 
 
@@ -81,7 +82,7 @@ def study_html(
     # limits over unknowns have a section of their own
     stated = [set_up for set_up in result.set_ups if not set_up.limit.record.drawn]
     shown = with_room(stated)
-    first_answer, *further_answers = map(unbroken, _answers(result))
+    answers = [unbroken(answer) for answer in _answers(result)]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
     figures |= _curves(shown)
     figures |= _tornadoes(result)
@@ -94,8 +95,8 @@ def study_html(
 
     return template("study.html").render(
         title=title,
-        answer=first_answer,
-        further_answers=further_answers,
+        answer=answers[0],
+        further_answers=answers[1:],
         conditions=result.conditions,
         rule=(
             f"Fixed in advance: a damage is found {result.record.hit_rule}, and no finding counts"
@@ -167,35 +168,46 @@ def _pictures(
 def _tornadoes(result: StudyResult) -> dict[str, str]:
     """Return the tornado chart of each set-up that has one, by the figure's name."""
     figures: dict[str, str] = {}
-    for set_up in result.set_ups:
-        if set_up.unknowns is None or set_up.unknowns.why:
-            continue
-        name = f"tornado-{len(figures) + 1}"
-        stated = stated_of(result, set_up.limit)
-        stated_mm = np.nan if stated is None else stated.a90_mm
-        figures[name] = tornado_figure(name, set_up, stated_mm)
+    for set_up, name in _drawn_set_ups(result):
+        if name:
+            stated = stated_of(result, set_up.limit)
+            stated_mm = np.nan if stated is None else stated.a90_mm
+            figures[name] = tornado_figure(name, set_up, stated_mm)
     return figures
+
+
+def _drawn_set_ups(result: StudyResult) -> list[tuple[SetUpResult, str]]:
+    """Return the set-ups that draw unknowns, each with the name of its tornado chart; empty where
+    the boards allow no effects."""
+    named_set_ups = []
+    charts = 0
+    for set_up in result.set_ups:
+        if set_up.unknowns is None:
+            continue
+        name = ""
+        if not set_up.unknowns.why:
+            charts += 1
+            name = f"tornado-{charts}"
+        named_set_ups.append((set_up, name))
+    return named_set_ups
 
 
 def _unknown_parts(result: StudyResult) -> list[dict[str, Any]]:
     """Return what the template shows of each set-up that draws unknowns: heading, sentence, figure
     and table."""
     parts: list[dict[str, Any]] = []
-    charts = 0
-    for set_up in result.set_ups:
-        if set_up.unknowns is None:
-            continue
+    set_ups = _drawn_set_ups(result)
+    sentences = unknown_sentences(result)
+    for (set_up, figure_name), sentence in zip(set_ups, sentences, strict=True):
         rows = unknown_rows([set_up])
-        charts += bool(rows)
-        parts.append(
-            {
-                "title": name_of(set_up.limit),
-                "figure": f"tornado-{charts}" if rows else "",
-                "table": UNKNOWN_TABLE.grid(rows, heads={"set-up": ""}).html() if rows else None,
-            }
-        )
-    for part, sentence in zip(parts, unknown_sentences(result), strict=True):
-        part["sentence"] = unbroken(sentence)
+        table = UNKNOWN_TABLE.grid(rows, heads={"set-up": ""}).html() if rows else None
+        part = {
+            "title": name_of(set_up.limit),
+            "sentence": unbroken(sentence),
+            "figure": figure_name,
+            "table": table,
+        }
+        parts.append(part)
     return parts
 
 

@@ -42,9 +42,11 @@ def tornado_figure(name: str, result: SetUpResult, stated_mm: float) -> str:
         labels = [plain(names[effect.unknown.key]) for effect in unknowns.effects]
         axes.set_yticks(range(len(labels)), labels)
         axes.set_ylim(len(labels) - 0.4, -0.6)
-        axes.set_xlim(right=min(axes.get_xlim()[1], most_mm))
+        right_mm = min(axes.get_xlim()[1], most_mm)
+        axes.set_xlim(right=right_mm)
         axes.set_xlabel("a90 (mm)")
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        handles, texts = axes.get_legend_handles_labels()
+        figure.legend(handles, texts, loc="outside lower center", ncols=2)
 
     alt = f"How far each unknown moves a90 of {result.limit.record.label}, as unknowns.csv says."
     return svg(name, (7.0, 1.4 + 0.45 * len(unknowns.effects)), alt, draw)
@@ -55,7 +57,8 @@ def _draw_bar(axes: Axes, row: int, effect: UnknownEffect, most_mm: float) -> No
     colour = BLUE if effect.beyond_chance else PALE
     sizes_mm = np.minimum(effect.a90_mm, most_mm)
     least_mm = sizes_mm[effect.least]
-    axes.barh(row, sizes_mm[effect.most] - least_mm, BAR, left=least_mm, color=colour)
+    length_mm = sizes_mm[effect.most] - least_mm
+    axes.barh(row, length_mm, BAR, left=least_mm, color=colour)
     for level, side in ((effect.least, -1), (effect.most, 1)):
         ends = effect.intervals_mm[level]
         low_mm = min(ends.low, most_mm)

@@ -105,17 +105,18 @@ def _set_up(
 
 
 def _drawn(unknown: UnknownConfig, point: Point, group: Group) -> DrawnUnknown:
-    """Return an unknown with what each damaged board of a point has of it."""
+    """Return an unknown with its level on each damaged board of a point: the number of one of its
+    values, or a number of its range."""
     boards = [batch.board or 0 for batch in group.then if batch.role == "damaged"]
-    drawn = [unknown.drawn(point.config.seed, "damaged", board) for board in boards]
+    levels = [unknown.drawn(point.config.seed, "damaged", board) for board in boards]
     if unknown.values is not None:
-        drawn = [unknown.values.index(value) for value in drawn]
+        levels = [unknown.values.index(value) for value in levels]
     return DrawnUnknown(
         key=unknown.key,
         stated=stated_value(point.config, unknown.key),
         reason=unknown.reason,
         board=np.array(boards),
-        level=np.array(drawn, float),
+        level=np.array(levels, float),
         values=unknown.values,
         range=unknown.range,
     )

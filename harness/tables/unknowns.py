@@ -53,6 +53,7 @@ def level_text(effect: UnknownEffect, level: int) -> str:
 
 
 def _value_text(key: str, value: Any) -> str:
+    """Return a value at a key in words, also one that is null."""
     return "none" if value is None else value_text(key, value)
 
 
@@ -60,8 +61,11 @@ def stated_text(unknown: DrawnUnknown) -> str:
     """Return the stated value in words; of a mapping, the keys that its values name."""
     stated = unknown.stated
     if isinstance(stated, dict):
-        named = [value for value in unknown.values or () if isinstance(value, dict)]
-        stated = {key: stated[key] for value in named for key in value if key in stated}
+        keys: dict[str, None] = {}
+        for value in unknown.values or ():
+            if isinstance(value, dict):
+                keys |= dict.fromkeys(value)
+        stated = {key: stated[key] for key in keys if key in stated}
     return _value_text(unknown.key, stated)
 
 
@@ -77,8 +81,8 @@ def unknown_rows(results: Sequence[SetUpResult]) -> list[UnknownRow]:
         effects = result.unknowns.effects if result.unknowns else ()
         names = unknown_names(effects)
         for rank, effect in enumerate(effects, start=1):
+            name = names[effect.unknown.key]
             for level in range(len(effect.levels)):
-                name = names[effect.unknown.key]
                 row = UnknownRow(
                     limit=result.limit, rank=rank, name=name, effect=effect, level=level
                 )
@@ -145,13 +149,18 @@ UNKNOWN_TABLE = Table(
 
 def stated_of(result: StudyResult, drawn: SetUpLimit) -> SetUpLimit | None:
     """Return the limit of the same set-up at the stated values; None if there is none."""
-    axes = {name: value for name, value in drawn.record.axes.items() if name != AXIS}
+    axes = _axes_but_unknowns(drawn)
     for limit in result.limits:
-        others = {name: value for name, value in limit.record.axes.items() if name != AXIS}
-        is_same = others == axes and limit.record.frames == drawn.record.frames
-        if is_same and not limit.record.drawn:
+        has_same_axes = _axes_but_unknowns(limit) == axes
+        has_same_frames = limit.record.frames == drawn.record.frames
+        if has_same_axes and has_same_frames and not limit.record.drawn:
             return limit
     return None
+
+
+def _axes_but_unknowns(limit: SetUpLimit) -> dict[str, Any]:
+    """Return a set-up's values of all axes but that of unknowns."""
+    return {name: value for name, value in limit.record.axes.items() if name != AXIS}
 
 
 def unknown_sentences(result: StudyResult) -> list[str]:
@@ -166,11 +175,16 @@ def unknown_headline(result: StudyResult) -> str:
     drawn = [set_up for set_up in result.set_ups if set_up.unknowns]
     if not drawn:
         return ""
-    best = min(drawn, key=lambda set_up: float(np.nan_to_num(set_up.limit.a90_mm, nan=np.inf)))
+
+    def a90_or_infinity(set_up: SetUpResult) -> float:
+        return float(np.nan_to_num(set_up.limit.a90_mm, nan=np.inf))
+
+    best = min(drawn, key=a90_or_infinity)
     return _sentence(result, best)
 
 
 def _sentence(result: StudyResult, set_up: SetUpResult) -> str:
+    """Return the sentence of a set-up that draws unknowns."""
     limit = set_up.limit
     unknowns = set_up.unknowns
     assert unknowns is not None
@@ -185,14 +199,15 @@ def _sentence(result: StudyResult, set_up: SetUpResult) -> str:
     names = unknown_names(unknowns.effects)
     deciding = [names[effect.unknown.key] for effect in unknowns.deciding]
     if not deciding:
-        most = unknowns.effects[0]
-        times = f"{names[most.unknown.key]}, a factor of {most.factor:.2f}"
-        return f"{label}: a90 is {sizes}; no unknown moves it beyond chance (at most {times})."
+        largest = unknowns.effects[0]
+        factor = f"{names[largest.unknown.key]}, a factor of {largest.factor:.2f}"
+        return f"{label}: a90 is {sizes}; no unknown moves it beyond chance (at most {factor})."
     if len(deciding) > 1:
         deciding[0] += " (most)"
-    ends = f"{text.size(unknowns.lowest_mm, limit.largest_mm)} to "
-    ends += _size(limit, unknowns.highest_mm)
-    return f"{label}: a90 is {ends}, depending on {_listed(deciding)}; {sizes}."
+    lowest = text.size(unknowns.lowest_mm, limit.largest_mm)
+    ends = f"{lowest} to {_size(limit, unknowns.highest_mm)}"
+    causes = text.joined_words(deciding)
+    return f"{label}: a90 is {ends}, depending on {causes}; {sizes}."
 
 
 def _size(limit: SetUpLimit, size_mm: float) -> str:
@@ -200,12 +215,6 @@ def _size(limit: SetUpLimit, size_mm: float) -> str:
     if np.isnan(size_mm):
         return "unknown"
     return f"{text.size(size_mm, limit.largest_mm)} mm"
-
-
-def _listed(words: Sequence[str]) -> str:
-    """Return ``a, b and c``."""
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def undetermined(facts: Any) -> tuple[str, ...]:

@@ -102,6 +102,13 @@ def many(count: int, noun: str) -> str:
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
+def joined_words(parts: Sequence[str]) -> str:
+    """Return ``a``, ``a and b``, or ``a, b and c``."""
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
 def unbroken(text: str) -> str:
     """Return ``text`` with no-break spaces between numbers and the words after them: ``0.7 m``,
     ``50 frames``."""

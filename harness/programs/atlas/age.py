@@ -37,8 +37,12 @@ def _states_todays_code(stored: Any, detectors: Any, cameras: Any) -> bool:
     settings do not count, as an atlas of other settings is not older."""
     if not isinstance(stored, Mapping):
         return False
-    of_code = {part: digest for part, digest in stored.items() if not part.startswith(EXPERIMENT)}
-    return not changed_parts(of_code, simulation_digests(detectors, cameras))
+    code_parts = {}
+    for part, digest in stored.items():
+        if not part.startswith(EXPERIMENT):
+            code_parts[part] = digest
+    today = simulation_digests(detectors, cameras)
+    return not changed_parts(code_parts, today)
 
 
 def _versions(detector: str, rows: Any) -> str:
@@ -46,7 +50,8 @@ def _versions(detector: str, rows: Any) -> str:
     stored = "an unknown version"
     if VERSION in rows:
         numbers = sorted({int(number) for number in rows[VERSION]})
-        stored = f"version {' and '.join(map(str, numbers))}"
+        versions = " and ".join(str(number) for number in numbers)
+        stored = f"version {versions}"
     try:
         now = f"now {detector_type(detector).version}"
     except UserError:

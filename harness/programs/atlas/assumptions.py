@@ -20,20 +20,21 @@ def assumed(
     """Return sentences on the facts of a table of unknowns without those that are ``axes`` of the
     atlas, for a kind of damage: the stated values and, by the nearest set-up of the table, the
     factors of a90."""
-    asked = {AXES[axis] for axis in axes if axis in AXES}
-    rows = table[~table["key"].isin(asked)]
+    varied_keys = {AXES[axis] for axis in axes if axis in AXES}
+    rows = table[~table["key"].isin(varied_keys)]
     names = names_of(sorted(set(rows["key"])))
-    facts = rows.drop_duplicates("key").set_index("key")["stated"].sort_index()
-    stated = [f"{names[str(key)]} {value}" for key, value in facts.items()]
+    value_by_key = rows.drop_duplicates("key").set_index("key")["stated"].sort_index()
+    stated = [f"{names[str(key)]} {value}" for key, value in value_by_key.items()]
     sentences = [f"Assumed, not measured: {', '.join(stated)}."]
     kinds = rows[DAMAGE].map(lambda damage: damage_of(damage)[0])
-    nearest = rows[kinds == kind]
-    if nearest.empty:
+    comparable = rows[kinds == kind]
+    if comparable.empty:
         return [*sentences, f"How far these move limits of {damage_words(kind)}s is not computed."]
-    if (nearest["detector"] == detector).any():
-        nearest = nearest[nearest["detector"] == detector]
-    distance = (nearest["frames"] - frames).abs()
-    nearest = nearest[distance == distance.min()]
+    has_detector = comparable["detector"] == detector
+    if has_detector.any():
+        comparable = comparable[has_detector]
+    distance = (comparable["frames"] - frames).abs()
+    nearest = comparable[distance == distance.min()]
     effects = nearest.sort_values("rank").drop_duplicates("key")
     first = effects.iloc[0]
     set_up = f"{damage_words(kind)}s, {first['detector']}, {many(int(first['frames']), 'frame')}"
@@ -47,9 +48,9 @@ def _moved(effects: pd.DataFrame, names: dict[str, str]) -> str:
     parts = []
     for effect in effects[is_certain].itertuples():
         parts.append(f"{names[str(effect.key)]} × {effect.factor:.2f}")
-    others = effects[~is_certain]
-    if not others.empty:
-        largest = others.iloc[0]
+    uncertain = effects[~is_certain]
+    if not uncertain.empty:
+        largest = uncertain.iloc[0]
         name = names[largest["key"]]
         lead = "no other" if parts else "none"
         parts.append(f"{lead} beyond chance (at most {name}, {largest['factor']:.2f})")
