@@ -59,14 +59,16 @@ class UnknownConfig(Config):
     def drawn(self, seed: int, purpose: str, number: int) -> Any:
         """Return the value for the board of a purpose, or the set-up, of this number."""
         size = PARTS if self.values is None else len(self.values)
-        block, place = divmod(number, size)
+        block = number // size
+        index = number % size
         stream = random_stream(seed, "unknown", self.key, purpose, block)
-        part = int(stream.permutation(size)[place])
+        part = int(stream.permutation(size)[index])
         if self.values is not None:
             return self.values[part]
         low, high = self.levels
-        share = (part + stream.random(size)[place]) / size
-        return float(f"{low + (high - low) * share:.{DIGITS}g}")
+        share = (part + stream.random(size)[index]) / size
+        value = low + (high - low) * share
+        return float(f"{value:.{DIGITS}g}")
 
 
 def is_same_fact(first: str, second: str) -> bool:
