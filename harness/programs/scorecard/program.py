@@ -275,19 +275,20 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
         for use in ("blind", "calibration", "code")
     }
     blind = by_use["blind"]
-    families: dict[str, list[scoring.Score]] = {}
+    by_group: dict[str, list[scoring.Score]] = {}
     for score in blind:
         first_word = score.figure.camera.partition("_")[0]
-        families.setdefault(GROUPS.get(first_word, "other cameras"), []).append(score)
-    by_family = ""
-    if len(families) > 1:
-        shares = [f"{name} {share(family)}" for name, family in families.items()]
-        by_family = f" ({', '.join(shares)})"
+        group = GROUPS.get(first_word, "other cameras")
+        by_group.setdefault(group, []).append(score)
+    shares_of_groups = ""
+    if len(by_group) > 1:
+        shares = [f"{name} {share(group_scores)}" for name, group_scores in by_group.items()]
+        shares_of_groups = f" ({', '.join(shares)})"
     values = [score for score in blind if score.strict is not None]
     bounds = [score for score in blind if score.strict is None]
     strict = sum(score.strict is True for score in values)
     wide = sum(score.passes_by_tolerance for score in values)
-    text = f"{share(blind)} blind figures pass{by_family}: "
+    text = f"{share(blind)} blind figures pass{shares_of_groups}: "
     text += f"{strict} of {len(values)} values within 25 %, {wide} by a wider tolerance of the "
     text += f"source, {share(bounds)} bounds; "
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
