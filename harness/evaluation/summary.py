@@ -39,7 +39,8 @@ def by_hole(names: pd.Series) -> pd.Series:
 
 def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
     """Return one row per (variant, frames, hole): counts, rates, sizes and positions, each with
-    its interval. ``axes``: columns to keep. ``status`` is by `FOUND_RULE`. ``extent_``: the
+    its interval. ``axes``: columns to keep. ``margin_``: highest score within the hit radius over
+    the threshold. ``status`` is by `FOUND_RULE`. ``extent_``: the
     thesis' measure. ``model_``: of the fit; its bias of depth is relative to ``seen_depth_mm``
     (behind a through-hole the backing is visible). ``model_diameter_covered``: share of fits
     within 1.96 standard errors. Means are over detected trials only: the sizes of a hole detected
@@ -53,6 +54,7 @@ def summarise_holes(holes: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFra
     out["rate_low"], out["rate_high"] = intervals.wilson(out["detected"], out["n"])
     certain = [out["rate_low"] > 0.5, out["rate_high"] < 0.5]
     out["status"] = np.select(certain, ["found", "missed"], "undecided")
+    out = out.join(_margins(holes))
     for measure in ("extent", "model"):
         out = pd.concat([out, _measured(groups, out, measure)], axis=1)
     out = pd.concat([out, _fitted(holes, out)], axis=1)
@@ -111,6 +113,18 @@ def false_calls(runs: pd.DataFrame) -> pd.DataFrame:
     out["per_run_low"] = low
     out["per_run_high"] = high
     return out.sort_values([*keys, "role"], key=_order, kind="stable", ignore_index=True)
+
+
+def _margins(holes: pd.DataFrame) -> pd.DataFrame:
+    """Return mean, lowest and highest margin over the trials of each group: the highest score
+    within the hit radius over the threshold."""
+    margins = holes.assign(margin=holes["signal"] / holes["threshold"])
+    groups = margins.groupby(GROUP, sort=False)
+    return groups.agg(
+        margin_mean=("margin", "mean"),
+        margin_lowest=("margin", "min"),
+        margin_highest=("margin", "max"),
+    )
 
 
 def _measured(

@@ -122,7 +122,7 @@ class DamageRow:
     ]
     score: Annotated[float, "score of the finding that matches it"] = NAN
     points: Annotated[int, "number of points of that finding"] = 0
-    signal: Annotated[float | None, "in a study: highest score within the hit radius"] = None
+    signal: Annotated[float, "highest score within the hit radius; empty if none is judged"] = NAN
     no_return: Annotated[
         bool | None,
         "in a study: whether a finding of pixels without a return matches it",

@@ -235,6 +235,11 @@ SUMMARY = Table(
         *_columns(
             status="found, missed or undecided: the interval lies above, lies below or contains 0.5"
         ),
+        *_columns(
+            margin_mean="highest score within the hit radius over the threshold: mean of trials",
+            margin_lowest="its lowest value",
+            margin_highest="its highest value",
+        ),
         _mean("extent_diameter", "extent (mm)"),
         _mean("model_diameter", "model (mm)"),
         *(

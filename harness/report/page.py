@@ -19,15 +19,15 @@ from harness.records.trials import (
     hole_list,
 )
 from harness.report import blocks, sections
-from harness.report.blocks import COLOURS, MARKERS
-from harness.report.claims import Verdict, claim_set_of
+from harness.report.claims import claim_set_of
 from harness.report.clouds import residual_figure
+from harness.report.margins import margin_figure, threshold_figure
 from harness.report.perspectives import map_files, map_text, perspectives_html
 from harness.report.set_ups_page import averaged_text, set_ups_html
 from harness.report.summaries import Summaries, summaries, verdicts_of
 from harness.report.view3d import write_view3d
 from harness.vocabulary.files import write_text
-from harness.vocabulary.text import inches, many
+from harness.vocabulary.text import inches
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,8 +93,8 @@ def report_html(
     clouds = [example for example in examples if example.variant == MAIN]
     clouds.sort(key=lambda cloud: cloud.frames)
     figures: dict[str, str] = {}
-    if frames:
-        figures["rates"] = rates_figure(main)
+    drawn = {"margins": margin_figure(main), "threshold": threshold_figure(calls, noise)}
+    figures |= {name: drawing for name, drawing in drawn.items() if drawing}
     if clouds:
         figures["residual"] = residual_figure(clouds)
     if len(noise) and (noise["temporal_rms_mm"] > 0).all():
@@ -105,7 +105,7 @@ def report_html(
         "sweep.html",
         tables,
         about,
-        answer_sentence(main, verdicts),
+        answer_sentence(main),
         figures,
         rule=sections.rule_note(int(main["n"].max()) if len(main) else 0),
         holes=sections.holes_grid(main).html(),
@@ -121,65 +121,38 @@ def _of_main(table: pd.DataFrame) -> pd.DataFrame:
     return table[table["variant"] == MAIN]
 
 
-def answer_sentence(main: pd.DataFrame, verdicts: Sequence[Verdict] = ()) -> str:
-    """State which holes were found with the most and the fewest frames (``main``: summary rows),
-    and the verdicts."""
+def answer_sentence(main: pd.DataFrame) -> str:
+    """State how many holes were found with the most and the fewest frames (``main``: summary
+    rows), and the smallest of them."""
     if main.empty:
         return "No trial of the main experiment finished, so there is no answer."
     frames = sorted(int(n) for n in main["frames"].unique())
-    most_frames = frames[-1]
-    fewest_frames = frames[0]
-    answer = f"With {averaged_text(most_frames)} the camera finds {_found_text(main, most_frames)}"
-    if fewest_frames != most_frames:
-        answer += f"; with {averaged_text(fewest_frames)} {_found_text(main, fewest_frames)}"
-    return f"{answer}.{sections.counted_verdicts(verdicts)}"
+    with_most = _found_text(main, frames[-1])
+    with_fewest = _found_text(main, frames[0])
+    if len(frames) == 1:
+        return f"With {averaged_text(frames[0])} the camera finds {with_most}."
+    if with_fewest == with_most:
+        few_and_many = f"{averaged_text(frames[0])} and with {frames[-1]}"
+        return f"With {few_and_many} the camera finds the same: {with_most}."
+    return (
+        f"With {averaged_text(frames[-1])} the camera finds {with_most};"
+        f" with {averaged_text(frames[0])}, {with_fewest}."
+    )
 
 
 def _found_text(main: pd.DataFrame, frames: int) -> str:
-    """Return ``8 of 11 holes (no. 4-11; the smallest is 6.35 mm, 1/4 in)``."""
+    """Return ``8 of 11 holes, from 6.35 mm (1/4 in)``."""
     status = found_holes(main, MAIN, frames)
     detected = [hole for hole, state in status.items() if state == "found"]
     undecided = [hole for hole, state in status.items() if state == "undecided"]
     text = f"{len(detected)} of {len(status)} holes"
     if detected:
         smallest_mm = float(main["true_diameter_mm"][main["hole"].isin(detected)].min())
-        drill = f", {inches(smallest_mm)}" if inches(smallest_mm) else ""
-        text += f" (no. {hole_list(detected)}; the smallest is {smallest_mm:.2f} mm{drill})"
+        drill = f" ({inches(smallest_mm)})" if inches(smallest_mm) else ""
+        text += f", from {smallest_mm:.2f} mm{drill}"
     if undecided:
-        text += f", with {hole_list(undecided)} undecided"
+        text += f", {hole_list(undecided)} undecided"
     return text
-
-
-def rates_figure(main: pd.DataFrame) -> str:
-    """Draw each hole's share of repeats that detected it (with Wilson intervals) against its
-    diameter, by frames."""
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        groups = main.groupby("frames")
-        for (frames, rows), colour, marker in zip(groups, COLOURS, MARKERS, strict=False):
-            by_size = rows.groupby("true_diameter_mm")[["rate", "rate_low", "rate_high"]].mean()
-            diameter_mm = by_size.index
-            low = by_size["rate_low"]
-            high = by_size["rate_high"]
-            label = many(int(str(frames)), "frame")
-            axes.fill_between(diameter_mm, low, high, color=colour, alpha=0.1, lw=0)
-            axes.plot(
-                diameter_mm,
-                by_size["rate"],
-                marker=marker,
-                ms=4,
-                color=colour,
-                label=label,
-            )
-        axes.axhline(0.5, color=blocks.GREY, lw=0.8, ls=":")
-        axes.set_xlabel("true diameter (mm)")
-        axes.set_ylabel("share of repeats that detected it")
-        axes.set_ylim(-0.03, 1.03)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-
-    alt = "Detection rate of each hole against its diameter, by frames."
-    return blocks.svg("rates", (5.4, 4.0), alt, draw)
 
 
 def noise_figure(noise: pd.DataFrame) -> str:

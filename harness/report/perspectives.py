@@ -107,8 +107,7 @@ def answer_sentence(
     claim_set: ClaimSet | None = None,
     verdicts: Sequence[Verdict] = (),
 ) -> str:
-    """State how many holes one view finds, how many the most views find by the best method, and
-    the verdicts."""
+    """State how many holes one view finds, and how many the most views find by the best method."""
     sentences = []
     for case in cases:
         sentence = _case_sentence(case)
@@ -118,8 +117,6 @@ def answer_sentence(
         return "No trial of any set-up finished, so there is no answer."
     if verdicts and claim_set is not None:
         sentences.insert(0, claim_set.lead_of_views(verdicts))
-        answers = [f"{verdict.claim} is {verdict.verdict}" for verdict in verdicts]
-        sentences.append(f"{', '.join(answers)}.")
     return " ".join(sentences)
 
 

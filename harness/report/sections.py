@@ -126,7 +126,7 @@ def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
     return joined(
         [
             heading(title),
-            paragraph(RULES_NOTE),
+            paragraph(f"{counted_verdicts(verdicts)} {RULES_NOTE}"),
             table.html(),
             fold("Criteria, fixed in advance", criteria.html()),
         ]
@@ -134,17 +134,14 @@ def claims_section(title: str, verdicts: Sequence[Verdict]) -> Markup:
 
 
 def counted_verdicts(verdicts: Sequence[Verdict]) -> str:
-    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``; empty without
-    verdicts."""
+    """Return ``Of 7 claims, 5 are borne out (C1, ...), 2 are undecided (...).``"""
     counts = []
     for answer in MARKS:
         claims = [verdict.claim for verdict in verdicts if verdict.verdict == answer]
         verb = "is" if len(claims) == 1 else "are"
         if claims:
             counts.append(f"{len(claims)} {verb} {answer} ({', '.join(claims)})")
-    if not counts:
-        return ""
-    return f" Of {many(len(verdicts), 'claim')}, {', '.join(counts)}."
+    return f"Of {many(len(verdicts), 'claim')}, {', '.join(counts)}."
 
 
 # ---------------------------------------------------------------- variations

@@ -17,7 +17,6 @@ from harness.records.examples import ExampleCloud
 from harness.records.trials import ERRORS, FALSE_CALLS, SET_UPS, ResultTables
 from harness.report import blocks, sections
 from harness.report.blocks import COLOURS, MARKERS
-from harness.report.claims import Verdict
 from harness.report.summaries import Summaries, of_set_ups, summaries, verdicts_of
 from harness.tables.study import axis_value
 from harness.vocabulary.path_names import in_words
@@ -62,7 +61,7 @@ def set_ups_html(
         figures["limits"] = limits_figure(compared, layout, frames)
     if len(costs):
         figures["effects"] = effects_figure(costs)
-    answer = set_ups_answer(compared, layout, costs, verdicts)
+    answer = set_ups_answer(compared, layout, costs)
     posterior_section = Markup("")
     claims_title = ""
     if about.claim_set is not None:
@@ -100,11 +99,8 @@ def averaged_text(frames: int) -> str:
     return "one frame" if frames == 1 else f"{frames} averaged frames"
 
 
-def set_ups_answer(
-    compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame, verdicts: Sequence[Verdict] = ()
-) -> str:
-    """State the loss due to effects or else each row's holes found with the most frames, and the
-    verdicts."""
+def set_ups_answer(compared: pd.DataFrame, layout: Layout, costs: pd.DataFrame) -> str:
+    """State the loss due to effects or else each row's holes found with the most frames."""
     if compared.empty:
         return "No trial of any set-up finished, so there is no answer."
     frames = sections.shown_frames(compared)
@@ -116,8 +112,6 @@ def set_ups_answer(
         ]
     else:
         sentences = [_found_sentence(compared, layout, frames[-1])]
-    for verdict in verdicts:
-        sentences.append(f"{verdict.claim} ({verdict.text.rstrip('.')}) is {verdict.verdict}.")
     return " ".join(sentences)
 
 

@@ -123,17 +123,13 @@ def _with_loudest_place(row: RunRow, judgement: Judgement) -> RunRow:
 def damage_rows(
     judgement: Judgement, threshold: float, point: str, origin: Origin
 ) -> list[DamageRow]:
-    """Return a row for each damage; in a study with its signal and whether it returned nothing."""
+    """Return a row for each damage; in a study with whether it returned nothing."""
     rows = []
     for index, damage in enumerate(judgement.labelled.truth):
         row = damage_row(judgement, threshold, index, damage, point, origin)
         if origin.board is not None:
             hits_without_return, _ = judgement.without_return
-            row = replace(
-                row,
-                signal=judgement.signals[index],
-                no_return=index in hits_without_return,
-            )
+            row = replace(row, no_return=index in hits_without_return)
         rows.append(row)
     return rows
 
@@ -180,6 +176,7 @@ def damage_row(
         invalid_fraction=invalid_fraction,
         median_residual_mm=median_m / MM,
         state=_state(judgement, index, invalid_fraction, median_m),
+        signal=judgement.signals[index],
     )
     largest = judgement.largest
     if index not in judgement.hits or largest is None:

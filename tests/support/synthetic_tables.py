@@ -261,6 +261,7 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
             "repeat": np.arange(n)
         }
         each |= {"detected": detected, "state": np.where(detected, "found", "invisible")}
+        each |= {"signal": np.where(detected, 9.0, 3.0)}
         parts.append(each | {name: np.where(detected, v, np.nan) for name, v in measured.items()})
     # one frame: tests make hundreds, and joining one for each hole took most of their time
     return pd.DataFrame(

@@ -15,7 +15,6 @@ import pytest
 
 from harness.evaluation.summary import summarise_holes
 from harness.programs.thesis.answers import THESIS
-from harness.programs.thesis.claims import score_claims
 from harness.report.page import answer_sentence, report_html, write_report
 from harness.report.sections import About, holes_grid
 from harness.vocabulary.errors import UserError
@@ -88,9 +87,9 @@ def outline(page: str) -> Outline:
 
 def test_sections_come_in_order(outline: Outline) -> None:
     assert outline.headings == [
+        "What the camera saw",
         "Holes against frames",
         "Sizes and positions",
-        "Range residual",
         "Noise against frames",
         "The thesis' claims",
         "If the facts were different",
@@ -124,7 +123,7 @@ def test_every_figure_is_well_formed_and_has_words_for_those_who_cannot_see(
     page: str, outline: Outline
 ) -> None:
     figures = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-    assert len(figures) == outline.labels == 3
+    assert len(figures) == outline.labels == 4
     for figure in figures:
         ET.fromstring(figure)
 
@@ -139,11 +138,12 @@ def test_the_same_input_gives_the_same_bytes(page: str, results: Tables) -> None
 
 
 def test_answer_counts_and_verdicts_are_told(page: str) -> None:
-    assert (
-        "With 50 averaged frames the camera finds 8 of 11 holes"
-        " (no. 4–11; the smallest is 6.35 mm, 1/4 in)" in page
+    answer = re.search(r'<p class="answer">(.*?)</p>', page).group(1)
+    assert answer == (
+        "With 50 averaged frames the camera finds 8 of 11 holes, from 6.35 mm (1/4 in);"
+        " with one frame, 7 of 11 holes, from 7.94 mm (5/16 in)."
     )
-    assert "with one frame 7 of 11 holes (no. 5–11; the smallest is 7.94 mm, 5/16 in)" in page
+    assert "Of 8 claims, 8 are borne out (C1, C1b, C2, C3, C4, C5, C6, C9). Each criterion" in page
     assert page.count("✓ borne out") == 8
     assert page.count(">50/50 <small>") == 7 + 8 + 8
     assert "0.93–1.00" in page
@@ -190,10 +190,8 @@ def test_a_claim_that_fails_is_shown_as_failing() -> None:
 def test_little_data_still_make_a_page() -> None:
     results = tables(World(repeats=1, rate=lambda hole, frames: 0.0), frames=(1,))
     page = report_html(results, [], About({}, "", "Averaging", THESIS))
-    assert (
-        "With one frame the camera finds 0 of 11 holes, with 1–11 undecided."
-        " Of 8 claims, 8 are undecided" in page
-    )
+    assert "With one frame the camera finds 0 of 11 holes, 1–11 undecided.</p>" in page
+    assert "Of 8 claims, 8 are undecided" in page
     assert "The one repeat is" in page
     assert "No data for this figure were stored." in page
     assert "not recorded" in page
@@ -235,10 +233,15 @@ def test_answer_tells_what_is_undecided() -> None:
     results = tables(
         World(rate=lambda hole, frames: 0.5 if hole == 5 else float(hole > 5)), frames=(1, 50)
     )
-    main = summarise_holes(results.holes)
-    sentence = answer_sentence(main, score_claims(results, summary=main))
-    assert "6 of 11 holes (no. 6–11; the smallest is 9.52 mm, 3/8 in), with 5 undecided" in sentence
-    assert sentence.endswith("1 is not borne out (C1), 2 are undecided (C2, C6).")
+    sentence = answer_sentence(summarise_holes(results.holes))
+    expected = "With one frame and with 50 the camera finds the same: 6 of 11 holes, from 9.52 mm"
+    assert sentence == f"{expected} (3/8 in), 5 undecided."
+
+
+def test_answer_of_one_number_of_frames() -> None:
+    sentence = answer_sentence(summarise_holes(tables(frames=(50,)).holes))
+    expected = "With 50 averaged frames the camera finds 8 of 11 holes, from 6.35 mm (1/4 in)."
+    assert sentence == expected
 
 
 def test_terminal_table_and_its_plain_twin_say_the_same() -> None:

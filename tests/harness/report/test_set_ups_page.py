@@ -141,7 +141,7 @@ def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     )
     assert f"Found of 11 holes at 0.5 m, 1 m {expected}" in answer
     # one unit of each camera
-    assert "is undecided" in answer
+    assert "Of 1 claim, 1 is undecided (C11)." in page
 
 
 def test_a_variation_is_shown_beside_its_set_up(page):

@@ -1,0 +1,188 @@
+"""What averaging buys, in two figures: each hole's margin over the threshold against the number of
+averaged frames, and the threshold in millimetres beside the noise that sets it.
+
+A margin is the highest score within the hit radius of a damage, divided by the threshold: above 1
+the damage exceeds the threshold, below 1 it is missed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.report import blocks
+from harness.vocabulary.text import many
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ACROSS = 4
+"""Panels side by side."""
+MOST_PANELS = 11
+"""Most sizes with a panel each; one further panel counts the holes found."""
+LABELLED = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
+"""Values that may stand beside a logarithmic axis."""
+ROOM = 1.25
+"""Factor between the highest margin and the upper end of its axis."""
+LABEL_ROOM = 1.5
+"""Factor below the lowest value for the name of its line."""
+STATUS_COLOURS = {"found": blocks.BLUE, "missed": blocks.RED, "undecided": blocks.GREY}
+
+
+def margin_figure(main: pd.DataFrame) -> str | None:
+    """Draw the margins of the main set-up's holes (``main``: rows of `SUMMARY`): against the
+    number of frames, with a panel for each size; against the size if there is one number of frames
+    or there are more than `MOST_PANELS` sizes. Return SVG text; None if no margin was stored."""
+    known = main[main["margin_mean"] > 0]
+    if not len(known):
+        return None
+    sizes_mm = known["true_diameter_mm"].unique()
+    if known["frames"].nunique() > 1 and len(sizes_mm) <= MOST_PANELS:
+        return _by_frames(main, known)
+    return _by_size(known)
+
+
+def _by_frames(main: pd.DataFrame, known: pd.DataFrame) -> str:
+    groups = list(known.groupby("true_diameter_mm"))
+    rows = -(-(len(groups) + 1) // ACROSS)
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(rows, ACROSS, sharex=True, squeeze=False).ravel()
+        for axes, (size_mm, group) in zip(panels, groups, strict=False):
+            holes = ", ".join(group["hole"].unique()[:3])
+            axes.set_title(f"no. {holes}: {size_mm:.1f} mm", fontsize=9)
+            _draw_margins(axes, group.sort_values("frames"), "frames")
+            _margin_axis(axes, known)
+            axes.tick_params(labelsize=8)
+        for axes in panels[: len(groups) : ACROSS]:
+            axes.set_ylabel("score / threshold", fontsize=9)
+        _draw_count(panels[len(groups)], main)
+        for axes in panels[len(groups) + 1 :]:
+            axes.set_visible(False)
+        panels[len(groups)].tick_params(labelsize=8)
+        _frames_axis(panels[0], known)
+        figure.supxlabel("frames averaged", fontsize=9)
+
+    alt = (
+        "Score over threshold of each hole against the number of averaged frames, and the number"
+        " of holes found."
+    )
+    return blocks.svg("margins", (6.8, 1.55 * rows + 0.3), alt, draw)
+
+
+def _by_size(known: pd.DataFrame) -> str:
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for _, group in known.groupby("frames"):
+            _draw_margins(axes, group.sort_values("true_diameter_mm"), "true_diameter_mm")
+        _margin_axis(axes, known)
+        axes.set(xlabel="true diameter (mm)", ylabel="score / threshold")
+
+    return blocks.svg(
+        "margins", (5.4, 4.0), "Score over threshold of each hole against its diameter.", draw
+    )
+
+
+def _draw_margins(axes: Axes, group: pd.DataFrame, column: str) -> None:
+    """Draw mean, lowest and highest margin over the repeats against a column of `SUMMARY`."""
+    places = group[column].to_numpy(float)
+    mean = group["margin_mean"].to_numpy(float)
+    low = group["margin_lowest"].to_numpy(float)
+    high = group["margin_highest"].to_numpy(float)
+    colours = [STATUS_COLOURS[status] for status in group["status"]]
+    axes.axhline(1, color=blocks.INK, lw=0.8, ls=(0, (4, 2)))
+    axes.plot(places, mean, color=blocks.GREY, lw=1, label="score / threshold")
+    axes.vlines(places, np.maximum(low, LABELLED[0]), high, colors=colours, lw=2)
+    axes.scatter(places, mean, c=colours, s=16, zorder=3)
+
+
+def _margin_axis(axes: Axes, known: pd.DataFrame) -> None:
+    """Give an axis of margins the ends that hold all of them."""
+    lowest = max(min(known["margin_lowest"].min(), 1) / ROOM, LABELLED[0])
+    highest = max(known["margin_highest"].max(), 1) * ROOM
+    axes.set_yscale("log")
+    axes.set_ylim(lowest, highest)
+    ticks = [tick for tick in LABELLED if lowest <= tick <= highest]
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+
+
+def _frames_axis(axes: Axes, known: pd.DataFrame) -> None:
+    """Give an axis of frames a logarithmic scale with a tick at each number."""
+    frames = sorted(known["frames"].unique())
+    axes.set_xscale("log")
+    axes.set_xticks(frames, [f"{n:g}" for n in frames])
+    axes.minorticks_off()
+
+
+def _draw_count(axes: Axes, main: pd.DataFrame) -> None:
+    """Draw the number of holes found against the number of frames."""
+    is_found = main["status"] == "found"
+    counts = is_found.groupby(main["frames"]).sum()
+    holes = main["hole"].nunique()
+    axes.set_title(f"found, of {many(holes, 'hole')}", fontsize=9)
+    axes.plot(counts.index, counts, color=blocks.INK, marker="o", ms=4, label="holes found")
+    axes.set_ylim(0, holes * 1.15)
+    for frames, count in counts.items():
+        axes.annotate(
+            str(count),
+            (float(str(frames)), count),
+            (0, -11),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+        )
+    axes.set_yticks([0, holes], ["0", str(holes)])
+
+
+def threshold_figure(calls: pd.DataFrame, noise: pd.DataFrame) -> str | None:
+    """Draw the threshold in millimetres (``calls``: rows of `FALSE_CALLS`) and the noise that sets
+    it (``noise``: rows of `NOISE_BY_FRAMES`) against the number of frames, of one variant. Return
+    SVG text; None if there are fewer than two numbers of frames."""
+    damaged = calls[calls["role"] == "damaged"]
+    table = damaged.merge(noise, on="frames")
+    table = table.sort_values("frames")
+    if len(table) < 2:
+        return None
+    lines: tuple[tuple[str, str, str], ...] = (
+        ("threshold_mm", blocks.INK, "threshold"),
+        ("pattern_mm", blocks.GREEN, "fixed pattern"),
+        ("temporal_rms_mm", blocks.BLUE, "noise of the average"),
+    )
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        frames = table["frames"].to_numpy(float)
+        for column, colour, label in lines:
+            values_mm = table[column].to_numpy(float)
+            axes.plot(frames, values_mm, color=colour, marker="o", ms=4, label=label)
+            _label_line(axes, frames, values_mm, colour, label)
+        axes.set_yscale("log")
+        _frames_axis(axes, table)
+        low_mm, high_mm = axes.get_ylim()
+        low_mm /= LABEL_ROOM
+        axes.set_ylim(low_mm, high_mm)
+        ticks: list[Any] = [tick for tick in LABELLED if low_mm <= tick <= high_mm]
+        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set(xlabel="frames averaged", ylabel="millimetres of range")
+
+    alt = "Threshold, fixed pattern and noise in millimetres against the number of averaged frames."
+    return blocks.svg("threshold", (4.4, 4.0), alt, draw)
+
+
+def _label_line(
+    axes: Axes, frames: np.ndarray, values_mm: np.ndarray, colour: str, label: str
+) -> None:
+    """Write a line's name and its first and last value below its right end."""
+    ends = dict.fromkeys(f"{value_mm:.2f}" for value_mm in (values_mm[0], values_mm[-1]))
+    axes.annotate(
+        f"{label}: {' to '.join(ends)} mm",
+        (frames[-1], values_mm[-1]),
+        (4, -14),
+        textcoords="offset points",
+        ha="right",
+        color=colour,
+        fontsize=9,
+    )
