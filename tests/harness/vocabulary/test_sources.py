@@ -38,7 +38,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def forget() -> None:
-    for cached in (reached_sources, source_digest, provenance._content):
+    for cached in (reached_sources, source_digest, provenance.first_content):
         cached.cache_clear()
 
 
