@@ -26,7 +26,7 @@ def summary() -> pd.DataFrame:
 
 
 def lines_of(drawing: str) -> list[list[Any]]:
-    """The lines of all panels: name, then drawn and true coordinates of each point."""
+    """Return the lines of all panels: name, then drawn and true coordinates of each point."""
     values = re.search(r'data-values="([^"]*)"', drawing)
     assert values is not None
     panels = json.loads(html.unescape(values.group(1)))
