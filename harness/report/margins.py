@@ -1,4 +1,4 @@
-"""What averaging buys, in two figures: each hole's margin over the threshold against the number of
+"""Figures of what averaging buys: each hole's margin over the threshold against the number of
 averaged frames, and the threshold in millimetres beside the noise that sets it.
 
 A margin is the highest score within the hit radius of a damage, divided by the threshold: above 1
