@@ -158,7 +158,7 @@ def threshold_figure(calls: pd.DataFrame, noise: pd.DataFrame) -> str | None:
         for column, colour, label in lines:
             values_mm = table[column].to_numpy(float)
             axes.plot(frames, values_mm, color=colour, marker="o", ms=4, label=label)
-            _label_line(axes, frames, values_mm, colour, label)
+            _label_line(axes, frames, values_mm, label)
         axes.set_yscale("log")
         _frames_axis(axes, table)
         low_mm, high_mm = axes.get_ylim()
@@ -172,9 +172,7 @@ def threshold_figure(calls: pd.DataFrame, noise: pd.DataFrame) -> str | None:
     return blocks.svg("threshold", (4.4, 4.0), alt, draw)
 
 
-def _label_line(
-    axes: Axes, frames: np.ndarray, values_mm: np.ndarray, colour: str, label: str
-) -> None:
+def _label_line(axes: Axes, frames: np.ndarray, values_mm: np.ndarray, label: str) -> None:
     """Write a line's name and its first and last value below its right end."""
     ends = dict.fromkeys(f"{value_mm:.2f}" for value_mm in (values_mm[0], values_mm[-1]))
     axes.annotate(
@@ -183,6 +181,5 @@ def _label_line(
         (4, -14),
         textcoords="offset points",
         ha="right",
-        color=colour,
         fontsize=9,
     )

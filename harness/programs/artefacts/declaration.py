@@ -35,7 +35,7 @@ class Across(Config):
 
 class QuotedTable(Config):
     """A table in a document. Formats name columns of the data: ``{a90_mm:.1f}``; ``!t`` turns the
-    name of a camera into its title."""
+    name of a camera into its title, ``!k`` the settings of a damage into its kind."""
 
     labels: dict[str, str]
     """Format of the leading cells by head; rows with equal labels are one row."""

@@ -5,6 +5,7 @@ and is written by `tofpod artefacts`, not by hand."""
 
 import csv
 import io
+import json
 import math
 import re
 import shlex
@@ -51,8 +52,12 @@ class _Formats(Formatter):
         return super().format_field(value, format_spec)
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        """Return a camera's title for ``!t``."""
-        return _title(value) if conversion == "t" else super().convert_field(value, conversion)
+        """Return a camera's title for ``!t``, and the kind of a damage for ``!k``."""
+        if conversion == "t":
+            return _title(value)
+        if conversion == "k":
+            return json.loads(value)["kind"]
+        return super().convert_field(value, conversion)
 
 
 def quotation(name: str, document: str, ledger: Ledger) -> str:

@@ -22,7 +22,7 @@ artefacts:
     commands: ['python make.py']
     rows: [results/made/latest/limits.csv]
     table:
-      labels: {camera: "{camera!t}"}
+      labels: {camera: "{camera!t}", damage: "{damage!k}"}
       across: {column: frames, head: "frames: {:g}"}
       cells: {a90: "{a90_mm:.1f} mm"}
       absent: none
@@ -44,7 +44,9 @@ MAKE = """
 from pathlib import Path
 out = Path("results/made/latest")
 out.mkdir(parents=True, exist_ok=True)
-rows = ["camera,frames,a90_mm,other", "kinect_v2,1,4.04,x", "kinect_v2,50,,x"]
+rows = ["camera,frames,a90_mm,damage"]
+for frames, a90_mm in ((1, "4.04"), (50, "")):
+    rows.append(f'kinect_v2,{frames},{a90_mm},"{{""kind"": ""blind""}}"')
 (out / "limits.csv").write_text("\\n".join(rows) + "\\n")
 with Path("count").open("a") as count:
     count.write("1")
@@ -59,9 +61,9 @@ PAGE = """A page.
 <!-- end: person -->
 The end.
 """
-TABLE = """| camera | a90, frames: 1 | a90, frames: 50 |
-|---|---|---|
-| Kinect v2 | 4.0 mm | none |"""
+TABLE = """| camera | damage | a90, frames: 1 | a90, frames: 50 |
+|---|---|---|---|
+| Kinect v2 | blind | 4.0 mm | none |"""
 CACHED = (
     declaration.declared_artefacts,
     declaration._command_digests,
