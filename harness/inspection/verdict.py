@@ -38,6 +38,7 @@ FLAGS = {
     " noise's reach, where the camera's filter mixes the rim with what is behind",
     "size_from_contour": "no shape fits: its diameter is that of its outline at half depth",
     "size_from_extent": "no shape was fitted: its diameter is that of its outermost points",
+    "depth_at_least": "so narrow that the camera's blur hides its floor: may be deeper than stated",
     "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
 }
 """The flags of findings, with their meaning."""
@@ -93,6 +94,7 @@ def flags_of(finding: Finding, *, is_cut: bool, least_score: float) -> tuple[str
         "open_behind": finding.kind == "no return" or finding.depth_mm > OPEN_MM,
         "size_from_contour": finding.size_from == "contour",
         "size_from_extent": finding.size_from == "extent",
+        "depth_at_least": finding.depth_is_least,
         "depth_from_extreme": finding.depth_from == "extreme residual",
     }
     return tuple(flag for flag in FLAGS if present[flag])

@@ -153,6 +153,7 @@ def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
         "size_from_extent",
         "depth_from_extreme",
     )
+    assert flags(depth_is_least=True) == ("depth_at_least",)
     assert flags(depth_mm=75.1) == ("open_behind",) and flags(depth_mm=74.9) == ()
     blind = finding(kind="no return", depth_mm=math.nan, score=1.0)
     assert flags_of(blind, is_cut=False, least_score=5.0) == ("open_behind",)
