@@ -126,6 +126,8 @@ class Measurement:
     model_depth_m: float = np.nan
     """Along the viewing axis from the fitted surface, positive behind it."""
     model_depth_se_m: float = np.nan
+    depth_is_least: bool = False
+    """True if the blur hides the floor, so that the damage may be deeper than the depth."""
     model_centre_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,): centre of the mouth, on the surface."""
     model_centre_se_m: float = np.nan

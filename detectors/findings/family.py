@@ -36,9 +36,17 @@ BLURS = (
 """Blurs that are tried for a recording, whose own is known by its noise alone: side over that of
 the noise, whether it is soft, and penalty in the information criterion. Rounded noise looks sharper
 than it is; a camera's maker may smooth the noise more than the scene."""
+FLOORS = (0.6, 0.36)
+"""Brightness of a hole's floor over that of the face, which are tried beside 1 where the camera's
+filter weighs pixels by their light. A floor is lit through the mouth, by an emitter beside the
+camera, and farther away; it weighs less, and the mouth looks smaller than it is."""
 MOST_OPEN = 0.3  # largest relative error of a radius that counts as measured
 RADIUS_ERROR_PX = 0.05
 """Error of the model's radius on simulated clouds, in pixels."""
+LENS_ERROR_PX2 = 0.18
+"""Error of the radius by that of the lens' blur, times the radius, in pixels: a disc of radius r
+and a blur of deviation s look like one of radius root(r^2 + 4 s^2), and s = 0.45 is known to 0.1.
+"""
 DIAMETER_ERROR: dict[Shape, float] = {"disc": 0.02, "cap": 0.035, "bowl": 0.035, "slot": 0.02}
 """Error of the model's diameter on simulated clouds, as a share of it: light between the slopes of
 a dent changes its profile."""
@@ -129,15 +137,26 @@ class ShapeFit:
         by_stretch = 0.5 * diameter_m if fit.shape == "slot" else 0.0
         slopes = np.array([diameter_m / fit.radius_m, by_stretch])
         fitted_m2 = float(slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes)
+        own_m2 = (DIAMETER_ERROR[fit.shape] * diameter_m) ** 2
+        return self.raised * fitted_m2 + 4.0 * self.edge_variance_m2 + own_m2
+
+    @property
+    def edge_variance_m2(self) -> float:
+        """Variance of the place of the mouth's edge by what the model leaves out of the blur."""
         pixel_m2 = float(np.trace(self.patch.metric_m2)) / 2.0
-        edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * pixel_m2
-        return self.raised * fitted_m2 + edge_m2 + (DIAMETER_ERROR[fit.shape] * diameter_m) ** 2
+        lens_m = LENS_ERROR_PX2 * pixel_m2 / self.fit.radius_m
+        return RADIUS_ERROR_PX**2 * pixel_m2 + lens_m**2
 
     @property
     def depth_variance_m2(self) -> float:
-        """Variance of the depth along the optical axis."""
-        fitted_m2 = float(self.fit.covariance[3, 3])
-        return self.raised * fitted_m2 + (DEPTH_ERROR * self.fit.depth_m) ** 2
+        """Variance of the depth along the optical axis. An error of the model's radius moves the
+        depth of a hole that the blur hides, whose volume alone is known."""
+        fit = self.fit
+        fitted_m2 = self.raised * float(fit.covariance[3, 3])
+        per_radius = float(fit.covariance[2, 3] / fit.covariance[2, 2])
+        own_m2 = (DIAMETER_ERROR[fit.shape] * fit.radius_m) ** 2
+        by_radius_m2 = per_radius**2 * (self.edge_variance_m2 + own_m2)
+        return fitted_m2 + by_radius_m2 + (DEPTH_ERROR * fit.depth_m) ** 2
 
 
 def sized(
@@ -164,7 +183,21 @@ def sized(
             if fit.converged and _is_determined(fit):
                 candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
+        if shape == "disc" and candidates and patch.brightness > 0.0:
+            candidates += _with_dim_floors(min(candidates, key=lambda c: c.criterion))
     return averaged(candidates) if candidates else None
+
+
+def _with_dim_floors(disc: ShapeFit) -> list[ShapeFit]:
+    """Fit a disc again with floors less bright than the face (`FLOORS`)."""
+    candidates = []
+    if disc.fit.depth_m > 0:
+        for brightness in FLOORS:
+            patch = replace(disc.patch, brightness=brightness)
+            fit = _fit(patch, _start_after(disc.fit), "disc")
+            if fit.converged and _is_determined(fit):
+                candidates.append(ShapeFit(fit, patch, disc.loss))
+    return candidates
 
 
 def _is_determined(fit: HoleFit) -> bool:

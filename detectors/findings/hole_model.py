@@ -132,6 +132,13 @@ class HolePatch:
     soft: bool = False
     """True if the blur falls off from its middle like a lens' or a beam's: two rectangles in turn,
     of 1 / sqrt(2) of its sides; False if it ends sharply like a filter's window."""
+    brightness: float = 0.0
+    """Light from the floor over that from the face, by which the camera's filter weighs pixels; 0
+    if it weighs all alike."""
+    half_m: float = math.inf
+    """Difference in depth at which the filter gives a pixel half of the weight."""
+    sharp_px: tuple[float, float] = (1.0, 1.0)
+    """Sides of the rectangle over which the lens and a pixel average, before the filter does."""
     shared_px: tuple[float, float] | None = None
     """Sides of the rectangle over which the noise is averaged; None: those of the blur."""
 
@@ -139,6 +146,12 @@ class HolePatch:
     def noise_px(self) -> tuple[float, float]:
         """Sides of the rectangle over which the noise is averaged."""
         return self.blur_px if self.shared_px is None else self.shared_px
+
+    @property
+    def weighing(self) -> tuple[float, float, float, float]:
+        """Brightness, half depth and sharp sides as the kernels take them."""
+        sharp_u, sharp_v = self.sharp_px
+        return self.brightness, self.half_m, sharp_u, sharp_v
 
     @property
     def prior_weight(self) -> float:
@@ -163,6 +176,7 @@ def pictures(patch: HolePatch, holes: np.ndarray, shape: Shape = "disc") -> np.n
         blur_u,
         blur_v,
         patch.soft,
+        patch.weighing,
         height,
         width,
     )
@@ -392,6 +406,7 @@ def fit_hole(
         blur_u,
         blur_v,
         patch.soft,
+        patch.weighing,
         height,
         width,
     )
@@ -471,10 +486,38 @@ def _drawn(  # type: ignore[no-untyped-def]
     blur_u,
     blur_v,
     soft,
+    weighing,
     h,
     w,
 ):
     """Return the `pictures` (m, h, w) of damages (m, 7) of a shape."""
+    images = _averaged(shape, holes, sights, metric, blur_u, blur_v, soft, h, w)
+    brightness, half, sharp_u, sharp_v = weighing
+    if shape != DISC or not (brightness > 0.0 or half < np.inf):
+        return images
+    sharp = _averaged(shape, holes, sights, metric, sharp_u, sharp_v, False, h, w)
+    mouths = holes.copy()
+    mouths[:, 3] = -1.0
+    faces = 1.0 + _averaged(shape, mouths, sights, metric, blur_u, blur_v, soft, h, w)
+    for n in range(len(images)):
+        if holes[n, 3] > 0.0:
+            _weigh(images[n], sharp[n], faces[n], holes[n, 3], brightness, half)
+    return images
+
+
+@numba.njit(**PLAIN)
+def _averaged(  # type: ignore[no-untyped-def]
+    shape,
+    holes,
+    sights,
+    metric,
+    blur_u,
+    blur_v,
+    soft,
+    h,
+    w,
+):
+    """Return the `pictures` (m, h, w) of a filter that weighs all pixels alike."""
     if soft:
         blur_u = math.sqrt(0.5) * blur_u
         blur_v = math.sqrt(0.5) * blur_v
@@ -487,6 +530,36 @@ def _drawn(  # type: ignore[no-untyped-def]
             _smooth_rows(images[n], blur_u)
             _smooth_rows(images[n].T, blur_v)
     return images
+
+
+@numba.njit(**PLAIN)
+def _weigh(  # type: ignore[no-untyped-def]
+    image,
+    sharp,
+    face,
+    depth,
+    brightness,
+    half,
+):
+    """Replace the depths of an image (h, w) of a hole, which are its ``depth`` times the floor's
+    share of each average, by those of a filter that does not weigh all pixels alike.
+
+    A ``brightness`` above 0 is that of the floor; what of it is not lit weighs nothing, and the
+    ``face`` (h, w) has the rest outside the mouth. A pixel that differs by ``half`` from that in
+    the middle of the filter, whose depth is ``sharp`` (h, w), has half of its weight."""
+    h, w = image.shape
+    per_half = (depth / half) ** 2
+    for r in range(h):
+        for c in range(w):
+            share = image[r, c] / depth
+            if share > 0.0:
+                middle = min(sharp[r, c] / depth, 1.0)
+                floor = share * 2.0 ** (per_half * (2.0 * middle - 1.0))
+                beside = 1.0 - share
+                if brightness > 0.0:
+                    floor = brightness * floor
+                    beside = max(face[r, c], 0.0)
+                image[r, c] = floor * depth / (floor + beside)
 
 
 @numba.njit(**PLAIN)
@@ -522,6 +595,7 @@ def _descent(  # type: ignore[no-untyped-def]
     blur_u,
     blur_v,
     soft,
+    weighing,
     h,
     w,
 ):
@@ -566,7 +640,9 @@ def _descent(  # type: ignore[no-untyped-def]
             holes[k, 4] = math.sin(0.5 * math.pi * trial_parameters[5]) ** 2
             holes[k, 5] = min(max(trial_parameters[6], -LONGEST), LONGEST)
             holes[k, 6] = trial_parameters[7]
-        image = _drawn(shape, holes[:1], sights, metric, blur_u, blur_v, soft, h, w).ravel()
+        image = _drawn(
+            shape, holes[:1], sights, metric, blur_u, blur_v, soft, weighing, h, w
+        ).ravel()
         for i in range(n):
             misfit[0, i] = image[pixels[i]] + trial_parameters[4] - data[i]
         prior = weight * (holes[0, 4] - WALL_PRIOR[0])
@@ -593,7 +669,9 @@ def _descent(  # type: ignore[no-untyped-def]
             for k in range(count):
                 holes[k + 1, varied[k]] += sizes[varied[k]]
             varied_holes = holes[1 : 1 + count]
-            drawn = _drawn(shape, varied_holes, sights, metric, blur_u, blur_v, soft, h, w)
+            drawn = _drawn(
+                shape, varied_holes, sights, metric, blur_u, blur_v, soft, weighing, h, w
+            )
             images = drawn.ravel()
             for k in range(count):
                 row = varied[k] if varied[k] < 4 else varied[k] + 1

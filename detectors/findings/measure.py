@@ -44,6 +44,12 @@ MOST_SIDE_PX = 24  # side of a patch from which means over squares of pixels are
 FEWEST_ACROSS = 6  # pixels of the fit across a detection
 LONG = 0.5  # logarithm of length over width from which a slot is tried
 MOST_STRETCH = 2.5  # largest start value of it
+PARTLY = 1.0
+"""Width of a mouth, in sides of the blur, from which a fit states a depth that is no lower bound:
+four fifths of the rectangle then lie within the mouth. Of narrower holes, a fit knows only the
+volume that their camera's filter leaves."""
+WHOLLY = math.sqrt(2.0)
+"""The same for a contour: the whole rectangle fits into the mouth."""
 OPEN_M = 20.0 * MM
 """The contour clips deeper residuals to this depth, to follow an oblique hole's mouth, not what
 shows through."""
@@ -63,13 +69,22 @@ class HoleModelConfig(Config):
 
     - ``blur_px``: side of the square over which the camera averages: 5 for the Azure Kinect's depth
       engine (OpenK4A), 3 for the Kinect v2 (libfreenect2), 1 for none.
-    - ``emitter_mm``: position of the light source in the camera's frame.
-    - ``linear_depth_mm``: at greater depths, the filter weights a deep neighbour by less than half,
-      and the contour at half depth is more reliable.
+    - ``lens_px``: standard deviation of the lens' blur, which widens the picture of a hole but not
+      the noise: 0.45 for the Azure Kinect (0.3 to 0.6 by edges of its infrared images).
+    - ``by_light``: whether the filter weighs pixels by their light, as the Kinect v2's does on
+      phasors; the Azure Kinect's does not.
+    - ``emitter_mm``: position of the light source in the camera's frame, which matters
+      ``by_light``: what it does not light weighs nothing. Other filters see the floor there too, by
+      the light of its surroundings.
+    - ``linear_depth_mm``: the filter gives a neighbour that is so much deeper half of the weight;
+      of deeper holes, the contour at half depth is more reliable. A recording's filter is not
+      known, and taken to weigh all alike.
     - ``largest_invalid``: share of the disc that may lack a range.
     - ``largest_relative_error``: of the diameter; beyond it, diameter and depth are ambiguous."""
 
     blur_px: int = Field(default=5, ge=1, le=31)
+    lens_px: float = Field(default=0.45, ge=0, le=5)
+    by_light: bool = False
     emitter_mm: tuple[float, float, float] = (-14.0, 0.0, 1.0)
     linear_depth_mm: float = Field(default=75.0, gt=0)
     largest_invalid: float = Field(default=0.1, ge=0, le=1)
@@ -221,6 +236,7 @@ def measure_detection(
         model_diameter_se_m=size.diameter_se_m,
         model_depth_m=size.depth_m,
         model_depth_se_m=size.depth_se_m,
+        depth_is_least=around.hides_floor(size.diameter_m, PARTLY),
         normal_share=around.normal_share,
         sight_share=around.sight_share,
         # standard error along one axis: the two axes on the surface share the trace
@@ -295,6 +311,11 @@ class _Surroundings:
         right = self.per_px_m[0] / np.linalg.norm(self.per_px_m[0])
         down = self.per_px_m[1] - (self.per_px_m[1] @ right) * right
         return right, down / np.linalg.norm(down)
+
+    def hides_floor(self, diameter_m: float, sides: float) -> bool:
+        """Return whether a hole is narrower than so many ``sides`` of the blur."""
+        diameter_px = diameter_m / math.sqrt(self.area_m2)
+        return self.sign > 0 and diameter_px < sides * max(self.patch.blur_px)
 
     def positioned(
         self,
@@ -372,6 +393,8 @@ def _surroundings(
         v0 = (v0 + 0.5) / binned - 0.5
         blur_u, blur_v = blur_px
         blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
+    blur_u, blur_v = blur_px
+    lens_u, lens_v = _lens_sides(cloud, config, blur_px)
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     widened = grown(detected, reach_px + 1)
@@ -394,7 +417,10 @@ def _surroundings(
         residual_m=residual_m,
         used=used,
         metric_m2=per_px_m @ per_px_m.T,
-        blur_px=blur_px,
+        blur_px=(math.hypot(blur_u, lens_u), math.hypot(blur_v, lens_v)),
+        brightness=1.0 if config.by_light else 0.0,
+        half_m=math.inf if cloud.noise_reach_px else config.linear_depth_mm * MM,
+        sharp_px=(math.hypot(1.0, lens_u), math.hypot(1.0, lens_v)),
         noise_m=noise_m,
         sights=_sights(cloud, origin_m, per_px_m, config),
         shared_px=blur_px,
@@ -479,6 +505,21 @@ def _means(picture: np.ndarray, side: int) -> np.ndarray:
     return np.where(2 * counts >= side**2, sums / np.maximum(counts, 1), np.nan)
 
 
+def _lens_sides(
+    cloud: Cloud,
+    config: HoleModelConfig,
+    blur_px: tuple[float, float],
+) -> tuple[float, float]:
+    """Return the sides of the rectangle with the second moments of the lens' blur, in the pixels in
+    which the camera's filter has the sides ``blur_px``. They are 0 for a recording, whose blur is
+    estimated: `BLURS` allow for its lens."""
+    if cloud.noise_reach_px:
+        return 0.0, 0.0
+    blur_u, blur_v = blur_px
+    per_blur = math.sqrt(12.0) * config.lens_px / config.blur_px
+    return per_blur * blur_u, per_blur * blur_v
+
+
 def _binned_blur(blur_px: float, binned: int) -> float:
     """Return the side, in means over squares of pixels, of a blur: second moments add."""
     return math.sqrt(blur_px**2 + binned**2 - 1.0) / binned
@@ -498,7 +539,9 @@ def _sights(
 ) -> np.ndarray:
     """Return the viewpoints (s, 8) of the camera that sees the surface's point (3,), or of all the
     cameras of a map."""
-    emitter_m = np.array(config.emitter_mm) * MM
+    emitter_m = np.zeros(3)
+    if config.by_light:
+        emitter_m = np.array(config.emitter_mm) * MM
     views = cloud.map_views
     if cloud.projection == "central":
         return np.array([sight(origin_m, per_px_m, emitter_m)])
@@ -713,6 +756,7 @@ def _by_contour(
         diameter_m -= (1.0 - top_m / around.peak_m) * math.sqrt(around.area_m2)
     diameter_se_m = math.hypot(flank_m, moved_m)
     depth_m, depth_se_m = _contour_depth(around, inside, residual_m)
+    is_least = around.hides_floor(diameter_m, WHOLLY)
     is_ragged = doubt == MISFIT
     if is_ragged:
         # the volume is known: the area's error is twice that of the diameter
@@ -721,14 +765,14 @@ def _by_contour(
         depth_m = volume_m3 / area_m2
         depth_se_m = abs(depth_m) * 2.0 * diameter_se_m / diameter_m
     if hollow.sum() > around.detected.sum():
-        depth_m = np.nan
-        depth_se_m = np.nan
+        is_least = around.sign > 0
     return replace(
         around.positioned(measured, u, v),
         model_diameter_m=diameter_m,
         model_diameter_se_m=diameter_se_m,
         model_depth_m=depth_m,
         model_depth_se_m=math.hypot(depth_se_m, DEPTH_ERROR * depth_m),
+        depth_is_least=is_least,
         normal_share=around.normal_share,
         sight_share=around.sight_share,
         shape="ragged" if is_ragged else "",

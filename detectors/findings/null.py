@@ -52,6 +52,7 @@ as much."""
 THEORY_AT_MARKS = 1.0
 """The same at marks: what print and edges make of the distance is no normal noise."""
 DRAWS = 4000  # of the interval
+TAIL_SHARE = 0.025  # probability of fewer false calls than its lower end; as much lies above
 HALVINGS = 48  # of the interval that holds a threshold: to rounding error
 CONTRADICTED = 0.1
 """A tail is rejected if the probability of the number of peaks above the threshold is lower."""
@@ -120,9 +121,9 @@ class OwnThreshold:
     at_marks: float
     """False calls of these that are expected at objects, print and edges in the picture."""
     low: float
-    """Lower end of the 95 % interval of that expectation."""
+    """Fewest false calls of the 95 % interval of their number (`counts_of`)."""
     high: float
-    """Upper end of it."""
+    """Most of it."""
     peaks: int
     """Number of peaks above the floor on which it is based."""
     floor: float
@@ -183,7 +184,7 @@ def own_threshold(
     rim_scale = tails[RIM].scale if RIM in tails else 1.0
     evidence = with_rim_scaled(evidence, rim_scale)
     expected = {name: 2.0 * tail.expected(threshold) for name, tail in tails.items()}
-    low, high = interval_of(tails, threshold)
+    low, high = counts_of(tails, threshold)
     rim = np.zeros(judged.shape, bool)
     if cloud.organised:
         rim = _mixed_rim(detector, cloud, evidence, threshold)
@@ -247,14 +248,33 @@ def _falls_to(number: float, expected: Callable[[float], float], least: float) -
     return low
 
 
-def interval_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
-    """Return the central 95 % of the expected number of false calls above a threshold, on both
-    sides of the surface and by all laws together."""
-    drawn = np.zeros(DRAWS)
+def counts_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
+    """Return the fewest and the most false calls of the central 95 % of their number above a
+    threshold, on both sides of the surface and by all laws together.
+
+    The number is Poisson, with the expectation of each of `DRAWS` laws that the peaks allow. So it
+    contains that the law is uncertain and that calls come by chance."""
+    expected = np.zeros(DRAWS)
     for tail in tails.values():
-        drawn += 2.0 * tail.laws(DRAWS).expected(threshold)
-    low, high = np.quantile(drawn, (0.025, 0.975))
-    return float(low), float(high)
+        expected += 2.0 * tail.laws(DRAWS).expected(threshold)
+    return _count_reaching(TAIL_SHARE, expected), _count_reaching(1.0 - TAIL_SHARE, expected)
+
+
+def _count_reaching(share: float, expected: np.ndarray) -> float:
+    """Return the smallest count that a Poisson number, with one of equally likely expectations
+    (k,), does not exceed with a probability of at least ``share``."""
+    low = -1
+    high = 1
+    while special.pdtr(high, expected).mean() < share:
+        low = high
+        high *= 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        if special.pdtr(middle, expected).mean() < share:
+            low = middle
+        else:
+            high = middle
+    return float(high)
 
 
 def _laws(
@@ -515,11 +535,6 @@ class Tail:
             return floor
 
         return _falls_to(number, self.expected, floor)
-
-    def interval(self, threshold: float) -> tuple[float, float]:
-        """Return the central 95 % of the expected number of peaks above a threshold."""
-        low, high = np.quantile(self.laws(DRAWS).expected(threshold), (0.025, 0.975))
-        return float(low), float(high)
 
     def laws(self, count: int) -> Laws:
         """Draw ``count`` laws that the peaks allow, the same ones every time."""

@@ -40,7 +40,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 8
+    version = 9
 
     @property
     def default_threshold(self) -> float | None:

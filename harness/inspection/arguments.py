@@ -217,7 +217,13 @@ def rate_text(arguments: argparse.Namespace) -> str:
     if arguments.quiet_capture is not None:
         return "thresholds that are silent on the quiet capture"
     calls = arguments.false_calls or DEFAULT_FALSE_CALLS
-    return f"{calls:g} expected false call{'s' * (calls != 1)}"
+    return expected_text(calls)
+
+
+def expected_text(calls: float) -> str:
+    """Return ``1 expected false call`` or ``14 expected false calls``."""
+    number = f"{calls:.2g}"
+    return f"{number} expected false call{'s' * (number != '1')}"
 
 
 def mapping_of(arguments: argparse.Namespace) -> MappingConfig:

@@ -37,6 +37,7 @@ from detectors.interface import Detector, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
 from detectors.pixels.masks import grown
 from detectors.pixels.noise import WIDEST_NATIVE_PX, reach_of_one, sigma_of
+from harness.inspection.arguments import expected_text
 from harness.inspection.judging import FALLBACK, analysed, threshold_of
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.seeds import random_stream
@@ -141,7 +142,7 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
 
     A candidate whose number of false calls is unknown is not compared with others whose is known.
     The first is taken unseen where no holes can be put in. ``calls``: the rate of false calls in
-    words."""
+    words, if their number is not known."""
     first = candidates[0]
     if len(candidates) == 1:
         return noted(first, "as only it has these settings")
@@ -155,7 +156,13 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
     if reach_px == 0.0:
         # a map, or frames that do not show it: what residuals share, with contours of rounding
         reach_px = reach_of_one(first.evidence.residual_m, 0.0)
-    sought = _sought(_with_equal_calls(compared), cloud, reach_px)
+    # at as many expected false calls as the one that expects fewest, if these numbers are known
+    fewest = float(np.min([candidate.expected for candidate in compared]))
+    searching = compared
+    if np.isfinite(fewest):
+        searching = [candidate.with_calls(fewest) for candidate in compared]
+        calls = expected_text(fewest)
+    sought = _sought(searching, cloud, reach_px)
     if sought is None:
         return noted(first, "as the target has no place for implanted holes")
     preferred = sorted(compared, key=lambda c: _rank(c.detector.name, reach_px))
@@ -173,15 +180,6 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
     }
     pixels = "upsampled pixels" if reach_px > WIDEST_NATIVE_PX else "a camera's own pixels"
     return noted(best, _reason(best.detector.name, sought, calls, pixels), facts)
-
-
-def _with_equal_calls(candidates: Sequence[Contender]) -> list[Contender]:
-    """Return the candidates at thresholds with as many expected false calls as the one that
-    expects fewest; as they are if these numbers are not known."""
-    fewest = min(candidate.expected for candidate in candidates)
-    if not all(np.isfinite(candidate.expected) for candidate in candidates):
-        return list(candidates)
-    return [candidate.with_calls(fewest) for candidate in candidates]
 
 
 def noted(candidate: Contender, why: str, facts: Mapping[str, Any] | None = None) -> Contender:

@@ -16,7 +16,7 @@ from detectors.findings.odds import noise_probabilities
 from detectors.interface import Detection, Detector, Evidence, Measurement
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
-from harness.inspection.verdict import calls_text, with_remarks
+from harness.inspection.verdict import FalseCalls, calls_text, with_remarks
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud
@@ -140,12 +140,11 @@ def threshold_of(
         unknown = "the number of false calls is unknown"
         origin = f"{FALLBACK}, {k:.3g} units of score: {unknown}; {peaks}"
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
-    expected = f"{calls_text(own.expected)} false calls expected"
-    interval = f"95 % interval {calls_text(own.low)} to {calls_text(own.high)}"
+    expected = FalseCalls(own.expected, own.low, own.high).text
     at_marks = ""
     if own.at_marks >= LEAST_AT_MARKS:
         at_marks = f", {calls_text(own.at_marks)} of them at objects, print and edges"
-    origin = f"from this capture's own null: {expected}{at_marks}, {interval}, from {peaks}"
+    origin = f"from this capture's own null: {expected}{at_marks}, from {peaks}"
     return own.threshold, origin, searched
 
 

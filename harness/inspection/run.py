@@ -555,11 +555,9 @@ def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
         rows.append(("share of the part", f"{100 * extent.judged_share:.0f} %"))
     if np.isfinite(extent.blind_m2):
         rows.append(("blind", f"{1e4 * extent.blind_m2:.3g} cm2"))
-    for name, expected in (
-        ("expected false calls", verdict.expected_false_calls),
-        ("of them among the sure", verdict.expected_false_sure),
-    ):
-        rows.append((name, "unknown" if np.isnan(expected) else calls_text(expected)))
+    false_sure = verdict.expected_false_sure
+    rows.append(("false calls", verdict.calls.text))
+    rows.append(("of them among the sure", calls_text(false_sure)))
     return rows
 
 

@@ -38,6 +38,7 @@ FLAGS = {
     " noise's reach, where the camera's filter mixes the rim with what is behind",
     "size_from_contour": "no shape fits: its diameter is that of its outline at half depth",
     "size_from_extent": "no shape was fitted: its diameter is that of its outermost points",
+    "depth_at_least": "so narrow that the camera's blur hides its floor: may be deeper than stated",
     "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
 }
 """The flags of findings, with their meaning."""
@@ -93,6 +94,7 @@ def flags_of(finding: Finding, *, is_cut: bool, least_score: float) -> tuple[str
         "open_behind": finding.kind == "no return" or finding.depth_mm > OPEN_MM,
         "size_from_contour": finding.size_from == "contour",
         "size_from_extent": finding.size_from == "extent",
+        "depth_at_least": finding.depth_is_least,
         "depth_from_extreme": finding.depth_from == "extreme residual",
     }
     return tuple(flag for flag in FLAGS if present[flag])
@@ -308,6 +310,26 @@ JOINTS = "joints"
 
 
 @dataclass(frozen=True)
+class FalseCalls:
+    """The false calls that the capture's own null predicts; NaN where it set no threshold."""
+
+    expected: float
+    """Their expected number."""
+    fewest: float
+    """Lower end of the 95 % interval of their number."""
+    most: float
+    """Upper end of it."""
+
+    @property
+    def text(self) -> str:
+        """Return ``1.0 false calls expected (0 to 4)``."""
+        if math.isnan(self.expected):
+            return "the number of false calls is unknown"
+        interval = f"({self.fewest:.0f} to {self.most:.0f})"
+        return f"{calls_text(self.expected)} false calls expected {interval}"
+
+
+@dataclass(frozen=True)
 class InspectionVerdict:
     """The answer of an inspection."""
 
@@ -318,8 +340,8 @@ class InspectionVerdict:
     sure_terms: dict[str, int]
     """Number of sure findings by term."""
     extent: Extent
-    expected_false_calls: float
-    """False calls expected in the capture; NaN where unknown."""
+    calls: FalseCalls
+    """False calls in the capture."""
     expected_false_sure: float
     """Number of sure findings that are expected to be false, the sum of their probabilities; NaN
     where these are unknown."""
@@ -334,7 +356,9 @@ class InspectionVerdict:
             "judged_area_m2": self.extent.judged_m2,
             "judged_share_of_outline": self.extent.judged_share,
             "blind_area_m2": self.extent.blind_m2,
-            "expected_false_calls": self.expected_false_calls,
+            "expected_false_calls": self.calls.expected,
+            "fewest_false_calls": self.calls.fewest,
+            "most_false_calls": self.calls.most,
             "expected_false_sure": self.expected_false_sure,
         }
 
@@ -353,28 +377,28 @@ def verdict_of(
             terms[finding.term] = terms.get(finding.term, 0) + 1
             false_sure += finding.noise_probability
     extent = extent_of(result, outline)
-    expected = expected_calls(result.evidence, threshold)
+    calls = calls_of(result.evidence, threshold)
     damage = [finding for finding in findings if finding.certainty != FEATURE]
     clauses = [_sure_clause(terms, extent, is_empty=not damage)]
     clauses += _other_clauses(damage, is_further=bool(terms))
     clauses += _joints_clauses(result.evidence.notes.get("joints", ()))
-    clauses.append(_calls_clause(expected, false_sure if terms else math.nan))
+    clauses.append(_calls_clause(calls, false_sure if terms else math.nan))
     return InspectionVerdict(
         sentence="; ".join(clauses) + ".",
         counts=counts,
         sure_terms=terms,
         extent=extent,
-        expected_false_calls=expected,
+        calls=calls,
         expected_false_sure=false_sure,
     )
 
 
-def expected_calls(evidence: Evidence, threshold: float) -> float:
-    """Return the number of false calls expected at the threshold, NaN unless the capture set it."""
+def calls_of(evidence: Evidence, threshold: float) -> FalseCalls:
+    """Return the false calls at the threshold; unknown unless the capture set it."""
     null = evidence.notes.get("own_null", {"threshold": None})
     if threshold != null["threshold"]:
-        return math.nan
-    return float(null["expected"])
+        return FalseCalls(math.nan, math.nan, math.nan)
+    return FalseCalls(expected=null["expected"], fewest=null["low"], most=null["high"])
 
 
 def _sure_clause(terms: dict[str, int], extent: Extent, *, is_empty: bool) -> str:
@@ -458,17 +482,19 @@ def _joints_clauses(joints: Sequence[dict[str, Any]]) -> list[str]:
     return clauses
 
 
-def _calls_clause(expected: float, false_sure: float) -> str:
-    """Return the clause on false calls: those among the sure findings, or else all of them."""
-    if not math.isnan(false_sure):
-        return f"{calls_text(false_sure)} false calls expected among the sure ones"
-    if math.isnan(expected):
-        return "the number of false calls is unknown"
-    return f"{calls_text(expected)} false calls expected"
+def _calls_clause(calls: FalseCalls, false_sure: float) -> str:
+    """Return the clause on false calls. ``false_sure``: those expected among the sure findings; NaN
+    if there are none."""
+    if math.isnan(calls.expected) or math.isnan(false_sure):
+        return calls.text
+    return f"{calls.text}, {calls_text(false_sure)} of them among the sure ones"
 
 
 def calls_text(expected: float) -> str:
-    """Return a number of false calls with a digit that means something; 0 below 1e-4."""
+    """Return a number of false calls with a digit that means something; 0 below 1e-4. NaN is
+    ``unknown``."""
+    if math.isnan(expected):
+        return "unknown"
     if expected >= 0.1:
         return f"{expected:.1f}"
     if expected >= 1e-4:

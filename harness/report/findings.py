@@ -90,6 +90,8 @@ class Finding:
     ``area`` (no return)."""
     depth_from: str
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
+    depth_is_least: bool = False
+    """True if the blur hides the floor, so that the damage may be deeper than stated."""
     noise_probability: float = math.nan
     """Probability that it is a false call: noise, or what an object or print makes of the measured
     distance. NaN if the capture does not set its own threshold."""
@@ -210,6 +212,7 @@ def finding_of(
         diameter_se_mm=measured.model_diameter_se_m / MM,
         depth_mm=depth_m / MM,
         depth_se_mm=measured.model_depth_se_m * normal_share / MM,
+        depth_is_least=measured.depth_is_least,
         sight_depth_mm=axial_depth_m * sight_share / MM,
         volume_mm3=measured.volume_m3 / MM**3,
         points=measured.points,

@@ -110,6 +110,51 @@ def test_pictures_of_several_holes_are_those_of_each():
     )
 
 
+def pixels_of(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share (h, w) of each pixel in which the lit floor is seen, and that of the face,
+    before the filter averages them."""
+    flat = np.array([*hole[:3], -1.0, 0.0])
+    sharp = replace(patch, blur_px=(1.0, 1.0))
+    return reference.picture(sharp, hole) / hole[3], 1.0 + reference.picture(sharp, flat)
+
+
+@pytest.mark.parametrize("radius_mm", [3.2, 4.5, 9.0])
+@pytest.mark.parametrize("brightness", [1.0, 0.4])
+def test_a_filter_by_light_is_that_of_phasors(brightness: float, radius_mm: float) -> None:
+    """Sums over 5 x 5 pixels of depth times light, over those of light."""
+    emitter_m = np.array([-80e-3, 0.0, 0.0])
+    sights = sight(CENTRE_M, PER_PX_M, emitter_m)[None]
+    patch = replace(blank_patch(sights=sights), brightness=brightness)
+    hole = np.array([18.3, 16.4, radius_mm * 1e-3, 33e-3, 0.0])
+    lit, face = pixels_of(patch, hole)
+    light = brightness * lit
+    depths_m = cv2.blur(light * hole[3], (5, 5)) / cv2.blur(light + face, (5, 5))
+    image = pictures(patch, hole[None])[0]
+    np.testing.assert_allclose(image, depths_m, atol=0.02 * hole[3])
+    alike = pictures(replace(patch, brightness=0.0), hole[None])[0]
+    assert np.abs(alike - depths_m).max() > 0.08 * hole[3]
+
+
+@pytest.mark.parametrize("radius_mm", [3.2, 4.5, 9.0])
+def test_a_filter_by_depth_weighs_deep_neighbours_less(radius_mm: float) -> None:
+    """A bilateral filter over 5 x 5 pixels, written out: a neighbour whose depth differs by 40 mm
+    has half of the weight."""
+    patch = replace(blank_patch(sights=sight(CENTRE_M, PER_PX_M, np.zeros(3))[None]), half_m=40e-3)
+    hole = np.array([18.3, 16.4, radius_mm * 1e-3, 33e-3, 0.0])
+    lit, _ = pixels_of(patch, hole)
+    pixels_m = np.pad(lit * hole[3], 2)
+    windows_m = np.lib.stride_tricks.sliding_window_view(pixels_m, (5, 5))
+    differences_m = windows_m - windows_m[..., 2:3, 2:3]
+    weights = 2.0 ** -((differences_m / 40e-3) ** 2)
+    depths_m = (weights * windows_m).sum(axis=(2, 3)) / weights.sum(axis=(2, 3))
+    image = pictures(patch, hole[None])[0]
+    np.testing.assert_allclose(image, depths_m, atol=0.05 * hole[3])
+    # of what the weights change, the picture has nine tenths
+    change_m = depths_m - pictures(replace(patch, half_m=np.inf), hole[None])[0]
+    left_m = depths_m - image
+    assert (left_m**2).sum() < 0.1 * (change_m**2).sum()
+
+
 def test_a_sight_equals_the_one_by_pseudo_inverses() -> None:
     normal = np.cross(*PER_PX_M)
     normal /= np.copysign(np.linalg.norm(normal), normal @ CENTRE_M)

@@ -29,6 +29,8 @@ FOCAL_PX = 504.0
 HEIGHT = 60
 WIDTH = 70
 REGION = Region(100, 100 + HEIGHT, 200, 200 + WIDTH)
+PLAIN = HoleModelConfig(lens_px=0.0, linear_depth_mm=1e5)
+"""A sharp lens before a filter that weighs all pixels alike."""
 MIDDLE = (250.0, 120.0)
 """Principal point (u, v) on the sensor."""
 
@@ -107,7 +109,7 @@ class Board:
         wall: float = 1.0,
         blur: int = 5,
         at: tuple[float, float] = (0.4e-3, -0.7e-3),
-        emitter_mm: tuple[float, float, float] = HoleModelConfig().emitter_mm,
+        emitter_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
         middle: tuple[float, float] = MIDDLE,
     ):
         self.depth_m = depth_mm * 1e-3
@@ -212,13 +214,19 @@ def detection_of(cloud: Cloud, score: float, pixels: np.ndarray) -> Detection:
     )
 
 
-def measured(board: Board, sigma_mm: float, seed: int, threshold: float = 5.0) -> Measurement:
+def measured(
+    board: Board,
+    sigma_mm: float,
+    seed: int,
+    threshold: float = 5.0,
+    config: HoleModelConfig = PLAIN,
+) -> Measurement:
     cloud, evidence = board.seen(sigma_mm, seed)
     return measure_detection(
         cloud,
         evidence,
         strongest(cloud, evidence, threshold),
-        HoleModelConfig(),
+        config,
     )
 
 
@@ -374,8 +382,9 @@ def test_the_picture_of_a_recording_decides_that_it_is_sharper_than_its_noise() 
     m = measure_detection(recording, evidence, detection, HoleModelConfig())
     assert 8.5e-3 < m.model_diameter_m < 10.0e-3
     # no recording: the model's own blur of 5 pixels is taken, and the hole is too narrow and deep
-    m = measure_detection(cloud, evidence, detection, HoleModelConfig())
-    assert "deeper than 75 mm" in m.model_note
+    m = measure_detection(cloud, evidence, detection, PLAIN)
+    assert m.model_diameter_m < 8.0e-3
+    assert m.model_depth_m > 3 * 9.0e-3
 
 
 def test_a_smooth_dent_is_not_taken_for_waves_of_the_noise() -> None:
@@ -410,9 +419,22 @@ def test_a_hole_lost_in_the_blur_falls_back_and_says_so() -> None:
     assert 2 * m.model_diameter_se_m > 0.95 * m.model_diameter_m
 
 
+def test_the_depth_of_a_hole_that_hides_its_floor_is_a_lower_bound() -> None:
+    """Five pixels are 7.5 mm wide: the filter's square lies in a mouth of 7.5 mm to four fifths, and
+    wholly in one of 10.6 mm. A bump has no floor to hide."""
+    assert measured(Board(6.5, 12.7), 0.02, 1).depth_is_least
+    assert not measured(Board(9.0, 12.7), 0.02, 1).depth_is_least
+    assert not measured(Board(6.5, -12.7), 0.02, 1).depth_is_least
+    for diameter_mm in (5.0, 19.0):
+        deep = Board(diameter_mm, 200.0, wall=0.0)
+        by_contour = measured(deep, 0.2, 3, config=HoleModelConfig())
+        assert "contour" in by_contour.model_note
+        assert by_contour.depth_is_least == (diameter_mm < 10.0)
+
+
 def test_a_deep_hole_falls_back_to_its_contour() -> None:
     board = Board(19.0, 200.0, wall=0.0, blur=1, emitter_mm=(0.0, 0.0, 0.0))
-    m = measured(board, 0.2, 3)
+    m = measured(board, 0.2, 3, config=HoleModelConfig())
     assert "deeper than 75 mm" in m.model_note
     assert m.model_diameter_m == pytest.approx(19.0e-3, abs=0.4e-3)
     assert m.model_depth_m == pytest.approx(0.2, abs=1e-3)
@@ -431,7 +453,7 @@ def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_thr
         middle=(50.0, 120.0),
     )
     through_m = np.sqrt((board.image > 0.25).sum() / (board.image > 0).sum()) * 19.0e-3
-    m = measured(board, 0.2, 3)
+    m = measured(board, 0.2, 3, config=HoleModelConfig())
     assert through_m < 11.0e-3
     assert "deeper than 75 mm" in m.model_note
     assert 14.0e-3 < m.model_diameter_m < 20.0e-3
@@ -453,8 +475,9 @@ def test_a_hole_without_range_inside_is_measured_by_its_contour() -> None:
     )
     assert "no range" in m.model_note
     assert m.model_diameter_m == pytest.approx(19.0e-3, abs=1.0e-3)
-    assert np.isnan(m.model_depth_m)
-    assert np.isnan(m.model_depth_se_m)
+    # its rim is all that is seen
+    assert m.depth_is_least
+    assert 0.0 < m.model_depth_m < 30e-3
     assert abs(m.model_diameter_m - 19.0e-3) < 2 * m.model_diameter_se_m < 4e-3
 
 

@@ -14,6 +14,7 @@ from detectors.findings.family import (
     BLURS,
     DEPTH_ERROR,
     DIAMETER_ERROR,
+    LENS_ERROR_PX2,
     RADIUS_ERROR_PX,
     ShapeFit,
     Start,
@@ -181,11 +182,25 @@ def test_errors_are_those_of_the_fit_of_what_it_leaves_and_of_the_model() -> Non
     inside = math.pi * 36.0 / 2.0 / 3.0
     raised = 1.0 + inside * 0.5
     assert slack.raised == pytest.approx(raised)
-    edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * 2.5e-6
-    expected_m2 = raised * 4e-8 + edge_m2 + (DIAMETER_ERROR["disc"] * 12e-3) ** 2
+    edge_m2 = RADIUS_ERROR_PX**2 * 2.5e-6 + (LENS_ERROR_PX2 * 2.5e-6 / 6e-3) ** 2
+    expected_m2 = raised * 4e-8 + 4.0 * edge_m2 + (DIAMETER_ERROR["disc"] * 12e-3) ** 2
     assert slack.diameter_variance_m2 == pytest.approx(expected_m2)
     assert slack.depth_variance_m2 == pytest.approx(raised * 4e-8 + (DEPTH_ERROR * 4e-3) ** 2)
     assert ShapeFit(fit_of("disc", 40.0), patch).raised == 1.0
+
+
+def test_errors_of_the_radius_move_the_depth_that_hangs_on_it() -> None:
+    """A fit that knows the volume alone: the depth falls by 2 x depth / radius per radius."""
+    patch = patch_of(FRONTAL_PX_M)
+    hidden = fit_of("disc", 40.0)
+    hidden.covariance[2, 3] = -2.0 * 4e-3 / 6e-3 * 1e-8
+    fit = ShapeFit(hidden, patch)
+    pixel_m2 = float(np.trace(patch.metric_m2)) / 2.0
+    edge_m2 = RADIUS_ERROR_PX**2 * pixel_m2 + (LENS_ERROR_PX2 * pixel_m2 / 6e-3) ** 2
+    radius_m2 = edge_m2 + (DIAMETER_ERROR["disc"] * 6e-3) ** 2
+    own_m2 = (DEPTH_ERROR * 4e-3) ** 2
+    expected_m2 = 4e-8 + (8.0 / 6.0) ** 2 * radius_m2 + own_m2
+    assert fit.depth_variance_m2 == pytest.approx(expected_m2)
 
 
 def test_a_slot_s_diameter_is_that_of_the_circle_with_its_area() -> None:
@@ -194,7 +209,8 @@ def test_a_slot_s_diameter_is_that_of_the_circle_with_its_area() -> None:
     size = averaged([slot])
     diameter_m = math.sqrt(4.0 / math.pi * 12e-3 * 36e-3)
     assert size.diameter_m == pytest.approx(diameter_m)
-    edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * np.trace(patch.metric_m2) / 2.0
+    pixel_m2 = np.trace(patch.metric_m2) / 2.0
+    edge_m2 = 4.0 * RADIUS_ERROR_PX**2 * pixel_m2 + (2.0 * LENS_ERROR_PX2 * pixel_m2 / 6e-3) ** 2
     fitted_m2 = (diameter_m / 6e-3) ** 2 * 1e-8 + (diameter_m / 2.0) ** 2 * 1e-4
     expected_m2 = fitted_m2 + edge_m2 + (DIAMETER_ERROR["slot"] * diameter_m) ** 2
     assert size.diameter_se_m**2 == pytest.approx(expected_m2)

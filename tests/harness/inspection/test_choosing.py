@@ -147,6 +147,8 @@ def test_one_with_more_false_calls_at_marks_is_compared_at_as_many(cloud: Cloud)
     found = best.evidence.notes["choice"]["found"]["thesis"]
     assert found < at_its_own.evidence.notes["choice"]["found"]["thesis"]
     assert best.threshold in (few_calls.threshold, many_calls.threshold)
+    text = best.evidence.notes["choice"]["text"]
+    assert f" at {few_calls.expected:.2g} expected false calls; " in text
 
 
 def test_equal_ones_are_told_by_the_pixels(cloud: Cloud) -> None:

@@ -36,7 +36,7 @@ def test_findings_carry_the_odds_of_the_captures_own_null() -> None:
         arguments(false_calls=3.0), DETECTOR, CLOUD, EVIDENCE, never
     )
     result = judged(DETECTOR, CLOUD, evidence, threshold)
-    assert "own null: 3.0 false calls expected, 95 % interval" in origin
+    assert "own null: 3.0 false calls expected (0 to 9), from" in origin
     assert evidence.warnings == ()
     assert len(result.findings) >= 2
     stated = [finding.noise_probability for finding in result.findings]
@@ -77,4 +77,4 @@ def test_calls_at_marks_are_stated_apart() -> None:
     null = evidence.notes["own_null"]
     assert null["at_marks"] > 0.05
     assert null["expected"] == pytest.approx(1.0 + null["at_marks"], rel=1e-6)
-    assert "of them at objects, print and edges, 95 % interval" in origin
+    assert "of them at objects, print and edges, from" in origin

@@ -23,7 +23,7 @@ from harness.inspection.verdict import (
 from harness.report.findings import Finding, Judged
 from harness.vocabulary.geometry import Cloud, Region
 
-NULL = {"threshold": 5.0, "expected": 1.0}
+NULL = {"threshold": 5.0, "expected": 1.0, "low": 0.0, "high": 4.0}
 PITCH_M = 0.002
 Z_M = 1.0
 
@@ -153,6 +153,7 @@ def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
         "size_from_extent",
         "depth_from_extreme",
     )
+    assert flags(depth_is_least=True) == ("depth_at_least",)
     assert flags(depth_mm=75.1) == ("open_behind",) and flags(depth_mm=74.9) == ()
     blind = finding(kind="no return", depth_mm=math.nan, score=1.0)
     assert flags_of(blind, is_cut=False, least_score=5.0) == ("open_behind",)
@@ -269,7 +270,7 @@ def test_the_sentence_counts_what_is_sure_and_names_the_rest() -> None:
     said = verdict_of(result, 5.0)
     assert said.sentence == (
         "Two holes found on 96 cm2 of the part; one further place is doubtful;"
-        " one place is cut by the rim; 1.0 false calls expected."
+        " one place is cut by the rim; 1.0 false calls expected (0 to 4)."
     )
     assert said.counts == {"sure": 2, "doubtful": 1, "rim or blind": 1}
     assert said.facts["sure"] == {"hole": 2}
@@ -282,15 +283,17 @@ def test_with_odds_the_sentence_says_how_many_of_the_sure_are_false() -> None:
     said = verdict_of(with_remarks(judged, 5.0), 5.0)
     assert said.sentence == (
         "Two holes found on 96 cm2 of the part; one further place is doubtful;"
-        " 0.03 false calls expected among the sure ones."
+        " 1.0 false calls expected (0 to 4), 0.03 of them among the sure ones."
     )
     assert said.expected_false_sure == pytest.approx(0.03)
-    assert said.expected_false_calls == 1.0
+    assert said.facts["expected_false_calls"] == 1.0
+    assert said.facts["fewest_false_calls"] == 0.0
+    assert said.facts["most_false_calls"] == 4.0
 
 
 def test_the_sentence_of_nothing_and_of_nothing_sure() -> None:
     nothing = verdict_of(with_remarks(judged_of(), 5.0), 5.0).sentence
-    assert nothing == "No damage found on 96 cm2 of the part; 1.0 false calls expected."
+    assert nothing == "No damage found on 96 cm2 of the part; 1.0 false calls expected (0 to 4)."
     unknown = verdict_of(with_remarks(judged_of(), 6.0), 6.0).sentence
     assert unknown.endswith("; the number of false calls is unknown.")
     doubtful = verdict_of(with_remarks(judged_of(5.1, 5.2), 5.0), 5.0).sentence

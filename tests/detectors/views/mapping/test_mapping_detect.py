@@ -107,7 +107,7 @@ def test_straight_sight_sees_no_parallax_on_a_facing_surface() -> None:
 # ---------------------------------------------------------------- a hole seen from several places
 
 HOLE = Hole(14.0 * MM, 9.0 * MM, (5.3 * MM, -3.1 * MM))
-LIT_FROM_THE_LENS = {"blur_px": 5, "emitter_mm": (0.0, 0.0, 0.0)}
+SHARP_LENS = {"blur_px": 5, "lens_px": 0.0}
 
 
 def hole_map(
@@ -144,7 +144,7 @@ def test_hole_on_a_map_has_its_size_and_place(
     cloud, T_plane_cloud, _ = hole_map(count, half_deg, FusedMerge(cell_mm=cell_mm))
     detector = ThesisDetector(
         ThesisConfig.from_data(
-            {"crop": {"kind": "none"}, "min_points": 3, "hole_model": LIT_FROM_THE_LENS}
+            {"crop": {"kind": "none"}, "min_points": 3, "hole_model": SHARP_LENS}
         )
     )
     _, measured = strongest(cloud, detector)
@@ -162,7 +162,7 @@ def test_places_of_the_cameras_matter_to_the_size() -> None:
     cloud, _, _ = hole_map(5, 25.0, FusedMerge())
     detector = ThesisDetector(
         ThesisConfig.from_data(
-            {"crop": {"kind": "none"}, "min_points": 3, "hole_model": LIT_FROM_THE_LENS}
+            {"crop": {"kind": "none"}, "min_points": 3, "hole_model": SHARP_LENS}
         )
     )
     _, reference = strongest(cloud, detector)
