@@ -1,6 +1,7 @@
 """Robust statistics, and the noise of an average: the error that rounding leaves, and the range of
 shared noise."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,8 +16,8 @@ from harness.vocabulary.geometry import Cloud, Frame
 REACH_FRAMES = 6  # frames that show the range of shared noise
 REACH_WINDOW_PX = 384  # side of the window at the centre of the valid pixels
 REACH_PIXELS = 5000
-"""Least number of pixels valid in two frames: they show a correlation to 0.07 if 25 pixels are
-alike."""
+"""Least number of pixels valid in pairs of frames, summed over all pairs: they show a correlation
+to 0.07 if 25 pixels are alike."""
 FARTHEST_LAG_PX = 30
 LARGEST_NOISE = 8.0
 """Largest difference of two frames, over the mean one, that is noise: 6 deviations."""
@@ -181,8 +182,9 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     if len(frames) == 1:
         return reach_of_one(pictures[0], z_step_m)
     lags: list[int] = []
+    least_pixels = math.ceil(REACH_PIXELS / max(len(pictures) - 1, 1))
     for first, second in pairwise(pictures):
-        lags += _lags(_noise_of_two(second - first))
+        lags += _lags(_noise_of_two(second - first, least_pixels))
     ends = [lag for lag in lags if 0 < lag <= FARTHEST_LAG_PX]
     return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
 
@@ -234,19 +236,23 @@ def _lags(noise_and_known: tuple[np.ndarray, np.ndarray] | None) -> list[int]:
     return [_first_unlike_lag(noise, usable), _first_unlike_lag(noise.T, usable.T)]
 
 
-def _window(picture: np.ndarray) -> np.ndarray | None:
-    """Return the part of a picture around the centre of its finite pixels; None if they are few."""
+def _window(picture: np.ndarray, least_pixels: int = REACH_PIXELS) -> np.ndarray | None:
+    """Return the part of a picture around the centre of its finite pixels; None if they are
+    fewer than ``least_pixels``."""
     rows, columns = np.isfinite(picture).nonzero()
-    if rows.size < REACH_PIXELS:
+    if rows.size < least_pixels:
         return None
     top = max(0, int(np.median(rows)) - REACH_WINDOW_PX // 2)
     first_column = max(0, int(np.median(columns)) - REACH_WINDOW_PX // 2)
     return picture[top : top + REACH_WINDOW_PX, first_column : first_column + REACH_WINDOW_PX]
 
 
-def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the noise (h, w) in the difference of two frames, and where it is known (h, w)."""
-    window = _window(difference)
+def _noise_of_two(
+    difference: np.ndarray, least_pixels: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the noise (h, w) in the difference of two frames, and where it is known (h, w); None
+    with fewer than ``least_pixels``."""
+    window = _window(difference, least_pixels)
     if window is None:
         return None
     usable = np.isfinite(window)
