@@ -39,8 +39,13 @@ FLAGS = {
     "size_from_contour": "no shape fits: its diameter is that of its outline at half depth",
     "size_from_extent": "no shape was fitted: its diameter is that of its outermost points",
     "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
+    "depth_open": "its depth's standard error is more than a third of it: the blur hides how deep"
+    " it is",
 }
 """The flags of findings, with their meaning."""
+OPEN_DEPTH = 1.0 / 3.0
+"""Standard error of a depth, as a share of it, from which the depth is open: it may then be a
+third of what is stated, or nearly twice as much."""
 MOST_NOISE = 0.05
 """Probability of a false call from which a finding is doubtful. Each sure finding is real with at
 least 95 %, so that fewer than one in 20 of them are expected to be false, however many there are.
@@ -94,6 +99,7 @@ def flags_of(finding: Finding, *, is_cut: bool, least_score: float) -> tuple[str
         "size_from_contour": finding.size_from == "contour",
         "size_from_extent": finding.size_from == "extent",
         "depth_from_extreme": finding.depth_from == "extreme residual",
+        "depth_open": finding.depth_se_mm > OPEN_DEPTH * abs(finding.depth_mm),
     }
     return tuple(flag for flag in FLAGS if present[flag])
 

@@ -661,7 +661,7 @@ FINDINGS_OF_CAPTURE = Table(
             "",
             "flags",
             "remarks, separated by spaces: faint, at_rim, open_behind, size_from_contour,"
-            " size_from_extent, depth_from_extreme (docs/recordings.md)",
+            " size_from_extent, depth_from_extreme, depth_open (docs/recordings.md)",
         ),
         Column(
             "term",

@@ -154,6 +154,9 @@ def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
         "depth_from_extreme",
     )
     assert flags(depth_mm=75.1) == ("open_behind",) and flags(depth_mm=74.9) == ()
+    assert flags(depth_se_mm=2.6) == () and flags(depth_se_mm=2.7) == ("depth_open",)
+    bump = finding(kind="bump", depth_mm=-3.0, depth_se_mm=1.1)
+    assert flags_of(bump, is_cut=False, least_score=5.0) == ("depth_open",)
     blind = finding(kind="no return", depth_mm=math.nan, score=1.0)
     assert flags_of(blind, is_cut=False, least_score=5.0) == ("open_behind",)
     assert verdict.class_of(blind, ("open_behind",)) == "rim or blind"
