@@ -161,7 +161,7 @@ def sized(
         first = replace(start, radius_m=radius_m)
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
-            if fit.converged and _is_determined(fit):
+            if fit.converged and _is_determined(fit) and _is_possible(fit, blurred):
                 candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
@@ -173,6 +173,19 @@ def _is_determined(fit: HoleFit) -> bool:
     depth_m2 = fit.covariance[3, 3]
     radius_is_known = 0.0 < radius_m2 < (MOST_OPEN * fit.radius_m) ** 2
     return bool(radius_is_known and depth_m2 < fit.depth_m**2)
+
+
+def _is_possible(fit: HoleFit, patch: HolePatch) -> bool:
+    """Return whether a solid has the fit's sizes: no cap of a sphere is deeper than its rim's
+    radius, and no sheet is pressed to a smooth hollow that is deeper than a half ball.
+
+    A blurred drilled hole that the disc does not explain exactly is otherwise fitted as a cap many
+    radii deep. The limit has room for two of the model's own errors of a depth."""
+    if fit.shape not in ("cap", "bowl"):
+        return True
+    cosine = float(patch.sights[:, 7] @ patch.sights[:, 0])
+    normal_depth_m = abs(fit.depth_m) * cosine
+    return normal_depth_m <= (1.0 + 2.0 * DEPTH_ERROR) * fit.radius_m
 
 
 def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:

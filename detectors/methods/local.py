@@ -119,7 +119,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 5
+    version = 6
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings

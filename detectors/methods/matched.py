@@ -88,7 +88,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 11
+    version = 12
 
     def __init__(self, settings: FilterConfig, covariance: np.ndarray | None = None) -> None:
         """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
