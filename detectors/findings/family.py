@@ -149,6 +149,7 @@ def sized(
     """Fit the shapes and average them; None if no fit has converged. ``blur_choices``: of `BLURS`,
     those to try."""
     blurs = _distinct_blurs(patch, blur_choices)
+    is_blur_known = len(blur_choices) == 1
     candidates = []
     for shape in shapes:
         radius_m = start.radius_m * WIDER[shape]
@@ -157,7 +158,8 @@ def sized(
         first = replace(start, radius_m=radius_m)
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
-            if fit.converged and _is_determined(fit) and _is_possible(fit, blurred):
+            is_possible = is_blur_known or _is_possible(fit, blurred)
+            if fit.converged and _is_determined(fit) and is_possible:
                 candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
     return averaged(candidates) if candidates else None
@@ -195,8 +197,9 @@ def _is_possible(fit: HoleFit, patch: HolePatch) -> bool:
     """Return whether a solid has the fit's sizes: no cap of a sphere is deeper than its rim's
     radius, and no sheet is pressed to a smooth hollow that is deeper than a half ball.
 
-    A blurred drilled hole that the disc does not explain exactly is otherwise fitted as a cap many
-    radii deep. The limit has room for two of the model's own errors of a depth."""
+    It is asked where the blur is not known: through a wrong one, the flanks of a drilled hole look
+    like those of a cap many radii deep, which then explains it better than a disc. The limit has
+    room for two of the model's own errors of a depth."""
     if fit.shape not in ("cap", "bowl"):
         return True
     cosine = float(patch.sights[:, 7] @ patch.sights[:, 0])
