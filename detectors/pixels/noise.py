@@ -344,7 +344,9 @@ def _mean_product(noise: np.ndarray, usable: np.ndarray, lag: int) -> float:
 
 def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | None:
     """Return the sides (2, r, c), along rows and along columns, of the rectangle over which noise
-    is averaged in r x c equal parts of a picture; None if a part and all around do not show it.
+    is averaged in r x c equal parts of a picture; None if a part with enough pixels and all around
+    it do not show it. Parts with too few pixels, as beyond the edge of the depth camera's view,
+    have the sides of the nearest part.
 
     Where a camera of another lens was upsampled, its pixels have different widths at each place.
     Successive frames of at least two differ by noise alone. Rounding to ``z_step_m`` makes noise
@@ -359,24 +361,31 @@ def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | Non
     row_parts = _parts(mean_m.shape[0])
     column_parts = _parts(mean_m.shape[1])
     sides_px = np.zeros((2, len(row_parts), len(column_parts)))
+    is_filled = np.zeros(sides_px.shape[1:], bool)
     for i, rows in enumerate(row_parts):
         for j, columns in enumerate(column_parts):
-            sides_px[:, i, j] = _sides_of_part(
-                noise_m[:, rows, columns],
-                usable[rows, columns],
-                local_means_m[rows, columns],
-                z_step_m,
-            )
+            is_filled[i, j] = usable[rows, columns].sum() >= REACH_PIXELS
+            if is_filled[i, j]:
+                sides_px[:, i, j] = _sides_of_part(
+                    noise_m[:, rows, columns],
+                    usable[rows, columns],
+                    local_means_m[rows, columns],
+                    z_step_m,
+                )
     sides_px[sides_px == 0.0] = np.nan
     with warnings.catch_warnings():
-        # parts without pixels, as where upsampled depth fills the middle of a picture only
+        # nothing is known around parts far beyond the edge of the depth camera's view
         warnings.simplefilter("ignore", RuntimeWarning)
         smooth_px = ndimage.generic_filter(
             sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
         )
-    if not np.isfinite(smooth_px).all():
+    is_unknown = ~np.isfinite(smooth_px).all(axis=0)
+    if is_unknown.all() or (is_unknown & is_filled).any():
         return None
-    return smooth_px.astype(np.float32)
+    nearest = ndimage.distance_transform_edt(
+        is_unknown, return_distances=False, return_indices=True
+    )
+    return smooth_px[:, *nearest].astype(np.float32)
 
 
 def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, float]:
@@ -412,10 +421,8 @@ def _sides_of_part(
     """Return the sides, along rows and along columns, that the noise (k, h, w) of differences of
     frames shows at usable pixels (h, w); 0 where it shows none. ``local_means_m`` (h, w): before
     the rounding."""
-    if usable.sum() < REACH_PIXELS:
-        return 0.0, 0.0
     sizes_m = np.abs(np.where(usable, noise_m, 0.0)).max(axis=0)
-    usable = usable & (sizes_m < LARGEST_NOISE * sizes_m[usable].mean())
+    usable = usable & (sizes_m <= LARGEST_NOISE * sizes_m[usable].mean())
     offsets_m = noise_m[:, usable].mean(axis=1)
     centred_m = np.where(usable, noise_m - offsets_m[:, None, None], 0.0)
     rounded_m2 = float(np.square(centred_m[:, usable]).mean())
