@@ -25,7 +25,8 @@ FEATURE = "feature"
 CLASSES = {
     SURE: "each is a false call with a probability below 0.05; where this is unknown, its score is"
     " at least 1.5 times the threshold",
-    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them",
+    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them, also at"
+    " the rim",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
     FEATURE: "slots that repeat across the part, such as joints: no damage",
 }
@@ -118,9 +119,11 @@ def class_of(finding: Finding, flags: Sequence[str]) -> str:
     """Return the class of a finding with these flags."""
     if finding.count > 1:
         return FEATURE
+    if "faint" in flags:
+        return DOUBTFUL
     if "at_rim" in flags or finding.kind == "no return":
         return RIM_OR_BLIND
-    return DOUBTFUL if "faint" in flags else SURE
+    return SURE
 
 
 def term_of(finding: Finding, floor_mm: float) -> str:

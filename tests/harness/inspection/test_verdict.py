@@ -122,6 +122,13 @@ def test_known_odds_decide_whatever_the_score(odds: float, certainty: str) -> No
         assert verdict.class_of(known, flags) == certainty
 
 
+def test_what_noise_may_explain_at_the_rim_is_doubtful() -> None:
+    faint = finding(noise_probability=0.4)
+    flags = flags_of(faint, is_cut=True, least_score=5.0)
+    assert flags == ("faint", "at_rim")
+    assert verdict.class_of(faint, flags) == "doubtful"
+
+
 def test_a_finding_at_the_rim_is_of_its_own_class() -> None:
     """The first row of the picture is the rim, the second is not."""
     result = with_remarks(judged_of(20.0, 20.0, rows=(0, 1)), 5.0)
