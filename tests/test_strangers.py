@@ -105,7 +105,7 @@ ANSWERED = (
     ("object_on_plate", 0), ("no_return", 0), ("saddle", 0), ("slots", 0), ("bumps", 0), ("dents", 0),
     ("dropouts", 0), ("pipe_outside", 0), ("sphere", 0), ("dark_patch", 1),
     ("quarter_mm", 0), ("undamaged", 0), ("passer_by", 0), ("resolutions", 0), ("corrugated", 20),
-    ("heavy_tails", 21),
+    ("heavy_tails", 21), ("own_flat_field", 0), ("own_flat_field", 1), ("sphere", 50), ("drilled", 31),
 )  # fmt: skip
 QUICK = ("before_wall", "pipe_outside")
 """A board before a wall, missing returns, a curved part."""

@@ -167,11 +167,8 @@ def sized(
 ) -> Size | None:
     """Fit the shapes and average them; None if no fit has converged. ``blur_choices``: of `BLURS`,
     those to try."""
-    blur_u, blur_v = patch.blur_px
-    blurs = []
-    for ratio, soft, loss in blur_choices:
-        blur_px = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
-        blurs.append((replace(patch, blur_px=blur_px, soft=soft), loss))
+    blurs = _distinct_blurs(patch, blur_choices)
+    is_blur_known = len(blur_choices) == 1
     candidates = []
     for shape in shapes:
         radius_m = start.radius_m * WIDER[shape]
@@ -180,7 +177,8 @@ def sized(
         first = replace(start, radius_m=radius_m)
         for blurred, loss in blurs:
             fit = _fit(blurred, first, shape)
-            if fit.converged and _is_determined(fit):
+            is_possible = is_blur_known or _is_possible(fit, blurred)
+            if fit.converged and _is_determined(fit) and is_possible:
                 candidates.append(ShapeFit(fit, blurred, loss))
                 first = _start_after(fit)
         if shape == "disc" and candidates and patch.brightness > 0.0:
@@ -200,12 +198,46 @@ def _with_dim_floors(disc: ShapeFit) -> list[ShapeFit]:
     return candidates
 
 
+def _distinct_blurs(
+    patch: HolePatch, blur_choices: Sequence[tuple[float, bool, float]]
+) -> list[tuple[HolePatch, float]]:
+    """Return the patch with each of the blurs, and the penalty of each. Blurs that come out as a
+    single pixel are one, whose evidence is the sum of theirs."""
+    blur_u, blur_v = patch.blur_px
+    evidence: dict[tuple[float, float, bool], float] = {}
+    for ratio, soft, loss in blur_choices:
+        sides = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
+        # a soft blur is two rectangles, of 1 / sqrt(2) of its sides, of which none is below a pixel
+        is_pixel = soft and max(sides) <= math.sqrt(2.0)
+        blur = (1.0, 1.0, False) if is_pixel else (*sides, soft)
+        evidence[blur] = evidence.get(blur, 0.0) + math.exp(-0.5 * loss)
+    blurs = []
+    for (side_u, side_v, soft), share in evidence.items():
+        blurred = replace(patch, blur_px=(side_u, side_v), soft=soft)
+        blurs.append((blurred, -2.0 * math.log(share)))
+    return blurs
+
+
 def _is_determined(fit: HoleFit) -> bool:
     """Return whether radius and depth are known, so that errors to first order mean something."""
     radius_m2 = fit.covariance[2, 2]
     depth_m2 = fit.covariance[3, 3]
     radius_is_known = 0.0 < radius_m2 < (MOST_OPEN * fit.radius_m) ** 2
     return bool(radius_is_known and depth_m2 < fit.depth_m**2)
+
+
+def _is_possible(fit: HoleFit, patch: HolePatch) -> bool:
+    """Return whether a solid has the fit's sizes: no cap of a sphere is deeper than its rim's
+    radius, and no sheet is pressed to a smooth hollow that is deeper than a half ball.
+
+    It is asked where the blur is not known: through a wrong one, the flanks of a drilled hole look
+    like those of a cap many radii deep, which then explains it better than a disc. The limit has
+    room for two of the model's own errors of a depth."""
+    if fit.shape not in ("cap", "bowl"):
+        return True
+    cosine = float(patch.sights[:, 7] @ patch.sights[:, 0])
+    normal_depth_m = abs(fit.depth_m) * cosine
+    return normal_depth_m <= (1.0 + 2.0 * DEPTH_ERROR) * fit.radius_m
 
 
 def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:

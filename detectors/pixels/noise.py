@@ -1,6 +1,7 @@
 """Robust statistics, and the noise of an average: the error that rounding leaves, and the range of
 shared noise."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,8 +16,8 @@ from harness.vocabulary.geometry import Cloud, Frame
 REACH_FRAMES = 6  # frames that show the range of shared noise
 REACH_WINDOW_PX = 384  # side of the window at the centre of the valid pixels
 REACH_PIXELS = 5000
-"""Least number of pixels valid in two frames: they show a correlation to 0.07 if 25 pixels are
-alike."""
+"""Least number of pixels valid in pairs of frames, summed over all pairs: they show a correlation
+to 0.07 if 25 pixels are alike."""
 FARTHEST_LAG_PX = 30
 LARGEST_NOISE = 8.0
 """Largest difference of two frames, over the mean one, that is noise: 6 deviations."""
@@ -181,8 +182,9 @@ def noise_reach_px(frames: Sequence[Frame], z_step_m: float) -> float:
     if len(frames) == 1:
         return reach_of_one(pictures[0], z_step_m)
     lags: list[int] = []
+    least_pixels = math.ceil(REACH_PIXELS / max(len(pictures) - 1, 1))
     for first, second in pairwise(pictures):
-        lags += _lags(_noise_of_two(second - first))
+        lags += _lags(_noise_of_two(second - first, least_pixels))
     ends = [lag for lag in lags if 0 < lag <= FARTHEST_LAG_PX]
     return float(np.median(ends)) if len(ends) > len(lags) / 2 else 0.0
 
@@ -234,19 +236,23 @@ def _lags(noise_and_known: tuple[np.ndarray, np.ndarray] | None) -> list[int]:
     return [_first_unlike_lag(noise, usable), _first_unlike_lag(noise.T, usable.T)]
 
 
-def _window(picture: np.ndarray) -> np.ndarray | None:
-    """Return the part of a picture around the centre of its finite pixels; None if they are few."""
+def _window(picture: np.ndarray, least_pixels: int = REACH_PIXELS) -> np.ndarray | None:
+    """Return the part of a picture around the centre of its finite pixels; None if they are
+    fewer than ``least_pixels``."""
     rows, columns = np.isfinite(picture).nonzero()
-    if rows.size < REACH_PIXELS:
+    if rows.size < least_pixels:
         return None
     top = max(0, int(np.median(rows)) - REACH_WINDOW_PX // 2)
     first_column = max(0, int(np.median(columns)) - REACH_WINDOW_PX // 2)
     return picture[top : top + REACH_WINDOW_PX, first_column : first_column + REACH_WINDOW_PX]
 
 
-def _noise_of_two(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the noise (h, w) in the difference of two frames, and where it is known (h, w)."""
-    window = _window(difference)
+def _noise_of_two(
+    difference: np.ndarray, least_pixels: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the noise (h, w) in the difference of two frames, and where it is known (h, w); None
+    with fewer than ``least_pixels``."""
+    window = _window(difference, least_pixels)
     if window is None:
         return None
     usable = np.isfinite(window)
@@ -338,7 +344,9 @@ def _mean_product(noise: np.ndarray, usable: np.ndarray, lag: int) -> float:
 
 def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | None:
     """Return the sides (2, r, c), along rows and along columns, of the rectangle over which noise
-    is averaged in r x c equal parts of a picture; None if a part and all around do not show it.
+    is averaged in r x c equal parts of a picture; None if a part with enough pixels and all around
+    it do not show it. Parts with too few pixels, as beyond the edge of the depth camera's view,
+    have the sides of the nearest part.
 
     Where a camera of another lens was upsampled, its pixels have different widths at each place.
     Successive frames of at least two differ by noise alone. Rounding to ``z_step_m`` makes noise
@@ -353,24 +361,31 @@ def noise_sides_px(frames: Sequence[Frame], z_step_m: float) -> np.ndarray | Non
     row_parts = _parts(mean_m.shape[0])
     column_parts = _parts(mean_m.shape[1])
     sides_px = np.zeros((2, len(row_parts), len(column_parts)))
+    is_filled = np.zeros(sides_px.shape[1:], bool)
     for i, rows in enumerate(row_parts):
         for j, columns in enumerate(column_parts):
-            sides_px[:, i, j] = _sides_of_part(
-                noise_m[:, rows, columns],
-                usable[rows, columns],
-                local_means_m[rows, columns],
-                z_step_m,
-            )
+            is_filled[i, j] = usable[rows, columns].sum() >= REACH_PIXELS
+            if is_filled[i, j]:
+                sides_px[:, i, j] = _sides_of_part(
+                    noise_m[:, rows, columns],
+                    usable[rows, columns],
+                    local_means_m[rows, columns],
+                    z_step_m,
+                )
     sides_px[sides_px == 0.0] = np.nan
     with warnings.catch_warnings():
-        # parts without pixels, as where upsampled depth fills the middle of a picture only
+        # nothing is known around parts far beyond the edge of the depth camera's view
         warnings.simplefilter("ignore", RuntimeWarning)
         smooth_px = ndimage.generic_filter(
             sides_px, np.nanmedian, size=(1, 3, 3), mode="constant", cval=np.nan
         )
-    if not np.isfinite(smooth_px).all():
+    is_unknown = ~np.isfinite(smooth_px).all(axis=0)
+    if is_unknown.all() or (is_unknown & is_filled).any():
         return None
-    return smooth_px.astype(np.float32)
+    nearest = ndimage.distance_transform_edt(
+        is_unknown, return_distances=False, return_indices=True
+    )
+    return smooth_px[:, *nearest].astype(np.float32)
 
 
 def noise_sides_at(cloud: Cloud, row: float, column: float) -> tuple[float, float]:
@@ -406,10 +421,8 @@ def _sides_of_part(
     """Return the sides, along rows and along columns, that the noise (k, h, w) of differences of
     frames shows at usable pixels (h, w); 0 where it shows none. ``local_means_m`` (h, w): before
     the rounding."""
-    if usable.sum() < REACH_PIXELS:
-        return 0.0, 0.0
     sizes_m = np.abs(np.where(usable, noise_m, 0.0)).max(axis=0)
-    usable = usable & (sizes_m < LARGEST_NOISE * sizes_m[usable].mean())
+    usable = usable & (sizes_m <= LARGEST_NOISE * sizes_m[usable].mean())
     offsets_m = noise_m[:, usable].mean(axis=1)
     centred_m = np.where(usable, noise_m - offsets_m[:, None, None], 0.0)
     rounded_m2 = float(np.square(centred_m[:, usable]).mean())

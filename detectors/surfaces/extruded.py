@@ -76,18 +76,24 @@ class Profile:
     central: bool
     """Whether rays leave the origin, else they run along z."""
     spread_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(k,): deviation of the surface itself at each knot, metres; empty until `with_spread`."""
+    """(k,): deviation of the surface's z at each knot, metres; empty until `with_spread`."""
     twist: Fit | None = None
     """Distance ahead, metres, by which a polynomial moves the surface."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return z (n,) of the surface on the rays of points (n, 3); NaN where it is unknown."""
         curve = self._curve_at(self.slopes(points))
+        share = self.ahead_by_z(points)
         if not self.central:
             beside_m = points[:, :2] @ self.ahead[:2]
-            return (curve + self._twisted_m(points) - beside_m) / self.ahead[2]
-        rays = points / points[:, 2:]
-        return (1.0 / curve + self._twisted_m(points)) / (rays @ self.ahead)
+            return (curve + self._twisted_m(points) - beside_m) / share
+        return (1.0 / curve + self._twisted_m(points)) / share
+
+    def ahead_by_z(self, points: np.ndarray) -> np.ndarray:
+        """Return how far ahead (n,) each of the points (n, 3) moves per z along its ray."""
+        if not self.central:
+            return np.full(len(points), self.ahead[2])
+        return points @ self.ahead / points[:, 2]
 
     def slopes(self, points: np.ndarray) -> np.ndarray:
         """Return the place (n,) of points (n, 3) across the direction, as the knots count it."""
@@ -149,18 +155,19 @@ class Profile:
         return self.spread_m[self.knots_of(points)]
 
     def with_spread(self, points: np.ndarray) -> Profile:
-        """Return the profile with its own deviation beside steps, as points (n, 3) show it.
+        """Return the profile with its own deviation in z beside steps, as points (n, 3) show it.
 
         A strip beside a step holds pixels of both of its sides, and its median is one of them. Its
         variance, less a usual strip's, is that of the surface. It counts at the quantile `OF_BANDS`
         of the bands along the direction, and up to the square of the step's height nearby."""
         count = len(self.curve)
         knots = self.knots_of(points)
-        heights_m2 = self._step_heights_m() ** 2
+        # residuals are along z
+        heights_m2 = (self._step_heights_m()[knots] / self.ahead_by_z(points)) ** 2
         squares_m2 = np.nan_to_num(points[:, 2] - self(points)) ** 2
         noise_m2 = group_medians(squares_m2, knots, count)[0] / 0.6745**2
         usual_m2 = float(np.nanmedian(noise_m2))
-        limited_m2 = np.minimum(squares_m2, heights_m2[knots] + usual_m2)
+        limited_m2 = np.minimum(squares_m2, heights_m2 + usual_m2)
         means_m2 = _means_in_bands(limited_m2, _bands(self.lengths(points)), knots, count)
         with warnings.catch_warnings():
             # no band shows a strip of few points
@@ -171,8 +178,8 @@ class Profile:
         return replace(self, spread_m=np.sqrt(spread_m2))
 
     def _step_heights_m(self) -> np.ndarray:
-        """Return the largest height (k,) of a step within `STEP_KNOTS` of each knot: the bend of
-        the curve over these beyond what a curvature over `CURVED_KNOTS` explains."""
+        """Return the largest height (k,) ahead of a step within `STEP_KNOTS` of each knot: the bend
+        of the curve over these beyond what a curvature over `CURVED_KNOTS` explains."""
         ahead_m = _filled(1.0 / self.curve if self.central else self.curve)
         bends_m = _bends(ahead_m, STEP_KNOTS)
         # the bend of a parabola grows with the square of the distance
@@ -387,9 +394,8 @@ def _twisted(profile: Profile, points: np.ndarray, rounds: int) -> Profile:
         residuals = points[:, 2] - fitted(points)
         scale = max(float(np.median(np.abs(residuals))) / 0.6745, 1e-9)
         weights = bisquare_weights(residuals, 6.0 * scale)
-        share = points @ profile.ahead / points[:, 2] if profile.central else profile.ahead[2]
         moved = points.copy()
-        moved[:, 2] = fitted._twisted_m(points) + residuals * share
+        moved[:, 2] = fitted._twisted_m(points) + residuals * fitted.ahead_by_z(points)
         fitted = replace(profile, twist=polynomial(moved, weights, degree=3)).fitted(points)
     return fitted
 

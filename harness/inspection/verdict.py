@@ -25,7 +25,8 @@ FEATURE = "feature"
 CLASSES = {
     SURE: "each is a false call with a probability below 0.05; where this is unknown, its score is"
     " at least 1.5 times the threshold",
-    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them",
+    DOUBTFUL: "noise, or what an object or print makes of the distance, may explain them, also at"
+    " the rim",
     RIM_OR_BLIND: "the rest of them lies outside the judged area, or no light came back",
     FEATURE: "slots that repeat across the part, such as joints: no damage",
 }
@@ -40,8 +41,13 @@ FLAGS = {
     "size_from_extent": "no shape was fitted: its diameter is that of its outermost points",
     "depth_at_least": "so narrow that the camera's blur hides its floor: may be deeper than stated",
     "depth_from_extreme": "its depth is that of its deepest point, which noise makes deeper",
+    "depth_open": "its depth's standard error is more than a third of it: the blur hides how deep"
+    " it is",
 }
 """The flags of findings, with their meaning."""
+OPEN_DEPTH = 1.0 / 3.0
+"""Standard error of a depth, as a share of it, from which the depth is open: it may then be a
+third of what is stated, or nearly twice as much."""
 MOST_NOISE = 0.05
 """Probability of a false call from which a finding is doubtful. Each sure finding is real with at
 least 95 %, so that fewer than one in 20 of them are expected to be false, however many there are.
@@ -96,6 +102,7 @@ def flags_of(finding: Finding, *, is_cut: bool, least_score: float) -> tuple[str
         "size_from_extent": finding.size_from == "extent",
         "depth_at_least": finding.depth_is_least,
         "depth_from_extreme": finding.depth_from == "extreme residual",
+        "depth_open": finding.depth_se_mm > OPEN_DEPTH * abs(finding.depth_mm),
     }
     return tuple(flag for flag in FLAGS if present[flag])
 
@@ -114,9 +121,11 @@ def class_of(finding: Finding, flags: Sequence[str]) -> str:
     """Return the class of a finding with these flags."""
     if finding.count > 1:
         return FEATURE
+    if "faint" in flags:
+        return DOUBTFUL
     if "at_rim" in flags or finding.kind == "no return":
         return RIM_OR_BLIND
-    return DOUBTFUL if "faint" in flags else SURE
+    return SURE
 
 
 def term_of(finding: Finding, floor_mm: float) -> str:

@@ -666,7 +666,8 @@ FINDINGS_OF_CAPTURE = Table(
             "",
             "flags",
             "remarks, separated by spaces: faint, at_rim, open_behind, size_from_contour,"
-            " size_from_extent, depth_at_least, depth_from_extreme (docs/recordings.md)",
+            " size_from_extent, depth_at_least, depth_open, depth_from_extreme"
+            " (docs/recordings.md)",
         ),
         Column(
             "term",

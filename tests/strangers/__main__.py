@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.strangers.kinds import KINDS
-from tests.strangers.recording import recorded, written
+from tests.strangers.recording import flat_field_arguments, recorded, written
 from tests.strangers.score import Score, answered, scored
 
 
@@ -23,7 +23,8 @@ def made(kind: str, seed: int, folder: Path) -> Score:
     stranger = KINDS[kind](rng)
     stack, view, truths = recorded(stranger, rng)
     path = written(stranger, stack, folder / "in")
-    code, printed, rows = answered(path, folder / "out", stranger.format.arguments)
+    arguments = (*stranger.format.arguments, *flat_field_arguments(stranger, rng, path))
+    code, printed, rows = answered(path, folder / "out", arguments)
     score = scored(stranger, view, truths, code, printed, rows)
     (folder / "answer.txt").write_text(f"{score.verdict}: {'; '.join(score.why)}\n{printed}")
     return score

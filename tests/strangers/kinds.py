@@ -932,6 +932,16 @@ def clouds_mm(rng: Rng) -> Stranger:
     )
 
 
+@kind
+def own_flat_field(rng: Rng) -> Stranger:
+    """A flat field that holds the damage: made of the capture's own frames, or of others from the
+    same place."""
+    created = fills_view(rng)
+    source = str(rng.choice(["own", "same place"]))
+    frames = int(rng.integers(8, 16))
+    return replace(created, frames=frames, flat_field=source, doubtful=True)
+
+
 # ---- nothing to find
 # -------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,8 @@ stranger would keep."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import struct
 from collections.abc import Callable
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 import scipy.io
 
+from harness.programs.camera import flatfield
 from tests.strangers.world import Camera, Damage, Surface, View, cast
 
 CLEAR_D = 3 * 5.5
@@ -77,6 +80,8 @@ class Stranger:
     nor false, because something real is there; ``doubtful``: no answer is right without a warning;
     ``per_frame(k, depth)`` changes the noise-free depth of frame k; ``louder`` (h, w) multiplies
     the noise; from ``gone`` (h, w) nothing returns; ``offset_m`` (h, w) is added to the depth.
+    ``flat_field``: a flat field that must not correct it, made of its own frames ("own") or of
+    other frames from the same place ("same place").
     ``model``: the project's own camera that takes the frames, from phasors without
     interreflection; ``noise`` then says only what is clearly visible in them."""
 
@@ -92,6 +97,7 @@ class Stranger:
     offset_m: np.ndarray | None = None
     per_frame: Callable[[int, np.ndarray], np.ndarray] | None = None
     model: str = ""
+    flat_field: str = ""
 
 
 def recorded(
@@ -340,6 +346,24 @@ def written(stranger: Stranger, stack: np.ndarray, folder: Path) -> Path:
     else:
         return _clouds(stranger, stored, folder)
     return path
+
+
+def flat_field_arguments(
+    stranger: Stranger, rng: np.random.Generator, path: Path
+) -> tuple[str, ...]:
+    """Make the flat field that the stranger uses for the recording at ``path``; returns the
+    arguments that name it."""
+    if not stranger.flat_field:
+        return ()
+    source = path
+    if stranger.flat_field == "same place":
+        again, _, _ = recorded(stranger, rng)
+        source = written(stranger, again, path.with_name("again"))
+    field = path.with_name("unit.npz")
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = flatfield.main([str(source), "--out", str(field)])
+    assert code == 0, f"no flat field of {source}"
+    return ("--flat-field", str(field))
 
 
 def _clouds(stranger: Stranger, stored: np.ndarray, folder: Path) -> Path:

@@ -22,7 +22,7 @@ FALSE_CALLS = 1
 DOUBTFUL_CALLS = 3
 """False findings of the class "doubtful" that a right answer may hold besides: with one expected,
 more than three happen by chance in 2 % of captures."""
-CAUSES = {"at_rim", "open_behind"}
+CAUSES = {"at_rim", "open_behind", "depth_open"}
 """Flags that warn of a wrong size."""
 FACTOR = 1.5
 """A size is right within this factor of what may rightly be called the size ..."""

@@ -18,6 +18,7 @@ from detectors.findings.family import (
     RADIUS_ERROR_PX,
     ShapeFit,
     Start,
+    _distinct_blurs,
     averaged,
     mixture,
     sized,
@@ -138,6 +139,34 @@ def test_where_the_blur_hides_the_shape_the_error_contains_all() -> None:
     assert size.diameter_se_m > 1.5 * alone.diameter_se_m
 
 
+@pytest.mark.parametrize("per_px_m", [FRONTAL_PX_M, OBLIQUE_PX_M])
+@pytest.mark.parametrize("shape", ["cap", "bowl"])
+@pytest.mark.parametrize(("radii", "is_possible"), [(1.0, True), (1.35, False), (4.0, False)])
+def test_no_hollow_of_a_smooth_shape_is_deeper_than_its_radius(
+    per_px_m: np.ndarray, shape: Shape, radii: float, is_possible: bool
+) -> None:
+    """``radii``: depth along the normal over the radius."""
+    blank = patch_of(per_px_m)
+    cosine = float(blank.sights[0, 0])
+    truth = numbers_of(shape, radii * 12e-3 / cosine)
+    draws = np.random.default_rng(5).standard_normal(blank.used.shape)
+    noise_m = cv2.blur(draws, (5, 3)) * math.sqrt(15.0) * 1e-4
+    patch = replace(blank, residual_m=pictures(blank, truth[None], shape)[0] + noise_m)
+    start = Start(
+        u_px=19.3,
+        v_px=17.6,
+        radius_m=9e-3,
+        depth_m=truth[3],
+        offset_m=0.0,
+        stretch=0.0,
+        angle_rad=0.0,
+    )
+    size = sized(patch, start, ("disc", "cap", "bowl"), BLURS[:2])
+    weights = {} if size is None else size.weights
+    assert (weights.get(shape, 0.0) > 0.5) is is_possible
+    assert (shape in weights) is is_possible
+
+
 def test_a_mixture_has_the_variance_within_and_between() -> None:
     mean, deviation = mixture(np.array([0.75, 0.25]), np.array([4.0, 8.0]), np.array([1.0, 2.0]))
     assert mean == pytest.approx(5.0)
@@ -234,3 +263,20 @@ def test_a_slot_s_angle_and_length_are_fitted() -> None:
     assert fit.converged
     np.testing.assert_allclose(fit.numbers[[0, 1, 6]], truth[[0, 1, 6]], atol=0.02)
     np.testing.assert_allclose(fit.numbers[[2, 3, 5]], truth[[2, 3, 5]], rtol=0.02)
+
+
+def test_blurs_of_a_single_pixel_are_one_with_the_evidence_of_all() -> None:
+    patch = replace(patch_of(FRONTAL_PX_M), blur_px=(1.0, 1.0))
+    sharp, wider = _distinct_blurs(patch, BLURS)
+    losses = np.array([loss for ratio, _, loss in BLURS if ratio != 1.5])
+    assert (sharp[0].blur_px, sharp[0].soft) == ((1.0, 1.0), False)
+    assert sharp[1] == pytest.approx(-2.0 * math.log(np.exp(-0.5 * losses).sum()))
+    assert (wider[0].blur_px, wider[0].soft, wider[1]) == ((1.5, 1.5), False, 4.0)
+    # two pixels and more: a soft blur differs from a sharp one
+    wide = _distinct_blurs(replace(patch, blur_px=(4.0, 3.0)), BLURS)
+    assert len(wide) == len(BLURS)
+    assert wide[2][0].blur_px == (4.0, 3.0) and wide[2][0].soft
+    # what counts as one is drawn alike
+    hole = numbers_of("disc")[None]
+    soft = replace(patch, blur_px=(1.4, 1.4), soft=True)
+    np.testing.assert_allclose(pictures(soft, hole), pictures(sharp[0], hole), atol=1e-12)

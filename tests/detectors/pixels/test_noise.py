@@ -268,15 +268,35 @@ def test_wide_noise_far_below_a_step_is_not_judged_where_rounding_hides_it() -> 
     assert np.median(sides_px[1][:, 4:]) == pytest.approx(12.5, abs=1.5)
 
 
-def test_a_picture_with_empty_parts_has_no_sides_and_no_warning() -> None:
-    """The left half has no range, as beyond the edge of the depth camera's view."""
-    empty = np.full((480, 960), np.nan, np.float32)
+@pytest.mark.parametrize("is_noisy", [True, False])
+def test_parts_without_pixels_have_the_sides_of_the_nearest_part(is_noisy: bool) -> None:
+    """The left half has no range, as beyond the edge of the depth camera's view. Where all frames
+    are alike, pixels do not show their noise."""
+    is_empty = np.arange(960) < 480
     frames = []
     for frame in upsampled_frames(0.3, 0.0):
-        frames.append(replace(frame, z_m=np.where(np.arange(960) < 480, empty, frame.z_m)))
+        frames.append(replace(frame, z_m=np.where(is_empty, np.float32(np.nan), frame.z_m)))
+    if not is_noisy:
+        frames = [frames[0]] * len(frames)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert noise_sides_px(frames, 0.0) is None
+        sides_px = noise_sides_px(frames, 0.0)
+    if not is_noisy:
+        assert sides_px is None
+        return
+    assert sides_px is not None
+    assert (sides_px[:, :, :2] == sides_px[:, :, 2:3]).all()
+    assert np.median(sides_px[0]) == pytest.approx(20.0, abs=2.0)
+    assert np.median(sides_px[1]) == pytest.approx(12.5, abs=1.5)
+
+
+def test_one_part_that_hides_its_noise_leaves_the_sides_unknown() -> None:
+    """All frames are alike in the left half, three parts wide."""
+    frames = upsampled_frames(0.3, 0.0)
+    still_m = frames[0].z_m
+    is_still = np.arange(960) < 480
+    frames = [replace(frame, z_m=np.where(is_still, still_m, frame.z_m)) for frame in frames]
+    assert noise_sides_px(frames, 0.0) is None
 
 
 def test_the_sides_at_the_middle_of_a_part_are_those_of_the_part() -> None:

@@ -317,6 +317,22 @@ def test_the_reach_of_noise_is_the_filter_times_the_upsampling(
     assert noise_reach_px([frames[0], frames[0]], 0.0) == 0.0
 
 
+@pytest.mark.parametrize("side", (1, 3, 5))
+def test_six_frames_of_a_small_target_show_the_reach_of_their_noise_and_two_do_not(
+    side: int,
+) -> None:
+    """Five pairs of 1,600 pixels show as much as one of 8,000; 5,000 are needed."""
+    rng = np.random.default_rng(4)
+    frames = []
+    for number in range(6):
+        z_m = np.full((100, 100), np.nan, np.float32)
+        noise_m = cv2.blur(rng.normal(0, 1e-3 * side, (60, 60)), (side, side))
+        z_m[30:70, 30:70] = 0.7 + noise_m[10:50, 10:50]
+        frames.append(Frame(str(number), z_m, np.zeros(z_m.shape, np.uint8)))
+    assert noise_reach_px(frames, 0.0) == side
+    assert noise_reach_px(frames[:2], 0.0) == 0.0
+
+
 @pytest.mark.parametrize("slope_m", (2e-4, 1.5e-3))
 @pytest.mark.parametrize(("side", "reach_px"), ((1, 1), (3, 3), (5, 5), (12, 8)))
 def test_a_lone_frame_shows_the_reach_of_its_noise_beside_edges(side, reach_px, slope_m) -> None:

@@ -81,6 +81,45 @@ def test_the_place_beside_a_step_is_uncertain_by_the_step_at_most() -> None:
     assert spread_of(stepped_m, residuals_m)[30] == pytest.approx(3e-3, rel=0.15)
 
 
+@pytest.mark.parametrize("central", [False, True])
+@pytest.mark.parametrize("tilt_deg", [0.0, 60.0])
+def test_a_step_of_a_tilted_sheet_is_higher_along_the_rays(central: bool, tilt_deg: float) -> None:
+    """A step of 3 mm on a sheet that is tilted along its profile, about the optical axis: rays
+    meet its sides 3 mm over the cosine of the tilt apart."""
+    cosine = np.cos(np.radians(tilt_deg))
+    sine = np.sin(np.radians(tilt_deg))
+    curve_m = 0.8 * cosine + 3e-3 * (np.arange(60) >= 30)
+    profile = Profile(
+        along=np.array([0.0, cosine, sine]),
+        across=np.array([1.0, 0.0, 0.0]),
+        ahead=np.array([0.0, -sine, cosine]),
+        first=-30e-3,
+        step=1e-3,
+        curve=1.0 / curve_m if central else curve_m,
+        central=central,
+    )
+    rows, columns = np.indices((200, 60)).reshape(2, -1)
+    z_m = 0.8 + 1e-4 * (rows - 99.5) * sine
+    y_m = 1e-4 * (rows - 99.5) * cosine
+    x_m = 1e-3 * (columns - 30.0) * (0.8 if central else 1.0)
+    points = np.stack([x_m, y_m, z_m], axis=1)
+    for _ in range(3):
+        on_sheet_m = profile(points)
+        if central:
+            points = points * (on_sheet_m / points[:, 2])[:, None]
+        else:
+            points[:, 2] = on_sheet_m
+    noise_m = 1e-4 * np.random.default_rng(6).standard_normal(len(points))
+    off_m = noise_m + np.where(columns == 30, 20e-3, 0.0)
+    if central:
+        points = points * (1.0 + off_m / points[:, 2])[:, None]
+    else:
+        points[:, 2] += off_m
+    spread_m = profile.with_spread(points).spread_m
+    knot = int(np.median(profile.knots_of(points[columns == 30])))
+    assert spread_m[knot] == pytest.approx(3e-3 / cosine, rel=0.2)
+
+
 def test_a_profile_knows_how_little_its_place_is_known_beside_steps() -> None:
     """Three in ten pixels of the strips beside a groove are on its other side, in all bands; a
     dent of 8 mm in two of ten bands does not make its strips uncertain."""

@@ -122,6 +122,13 @@ def test_known_odds_decide_whatever_the_score(odds: float, certainty: str) -> No
         assert verdict.class_of(known, flags) == certainty
 
 
+def test_what_noise_may_explain_at_the_rim_is_doubtful() -> None:
+    faint = finding(noise_probability=0.4)
+    flags = flags_of(faint, is_cut=True, least_score=5.0)
+    assert flags == ("faint", "at_rim")
+    assert verdict.class_of(faint, flags) == "doubtful"
+
+
 def test_a_finding_at_the_rim_is_of_its_own_class() -> None:
     """The first row of the picture is the rim, the second is not."""
     result = with_remarks(judged_of(20.0, 20.0, rows=(0, 1)), 5.0)
@@ -155,6 +162,9 @@ def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
     )
     assert flags(depth_is_least=True) == ("depth_at_least",)
     assert flags(depth_mm=75.1) == ("open_behind",) and flags(depth_mm=74.9) == ()
+    assert flags(depth_se_mm=2.6) == () and flags(depth_se_mm=2.7) == ("depth_open",)
+    bump = finding(kind="bump", depth_mm=-3.0, depth_se_mm=1.1)
+    assert flags_of(bump, is_cut=False, least_score=5.0) == ("depth_open",)
     blind = finding(kind="no return", depth_mm=math.nan, score=1.0)
     assert flags_of(blind, is_cut=False, least_score=5.0) == ("open_behind",)
     assert verdict.class_of(blind, ("open_behind",)) == "rim or blind"
