@@ -32,6 +32,8 @@ RINGS = 3  # weights of an input: of the middle tap, of the four beside it, and 
 HALF = np.float32(0.5)
 """Factor of the sum of a ring's four taps, which leaves the deviation of independent noise."""
 INPUTS = 2  # pictures that a network sees: whitened residuals, and where pixels are known
+STRIP_PIXELS = 1 << 17
+"""Pixels of a strip in which a picture is judged: 24 channels then need 80 MB."""
 MOST_LAYERS = 64
 MOST_DILATION_PX = 1000
 AGAIN = "write it again with tofpod train"
@@ -70,7 +72,21 @@ class Network:
 
     def log_odds(self, pictures: np.ndarray) -> np.ndarray:
         """Return the logarithm (r, c) of the odds of damage from pictures (`INPUTS`, r, c)
-        float32; beyond their edges, values are 0."""
+        float32; beyond their edges, values are 0 in every layer.
+
+        Large pictures are cut into strips that overlap by the reach, so that memory stays small
+        and results are those of the whole."""
+        _, height, width = pictures.shape
+        rows = max(STRIP_PIXELS // width, 4 * self.reach_px, 1)
+        log_odds = np.empty((height, width), pictures.dtype)
+        for first in range(0, height, rows):
+            end = min(first + rows, height)
+            top = max(first - self.reach_px, 0)
+            strip = self._log_odds_of_strip(pictures[:, top : end + self.reach_px])
+            log_odds[first:end] = strip[first - top : end - top]
+        return log_odds
+
+    def _log_odds_of_strip(self, pictures: np.ndarray) -> np.ndarray:
         values = pictures
         for layer in self.layers[:-1]:
             values = np.maximum(convolved(values, layer), np.float32(0.0))

@@ -71,6 +71,15 @@ def test_a_turned_or_mirrored_picture_gives_turned_or_mirrored_odds():
     np.testing.assert_allclose(mirrored, log_odds[:, ::-1], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("height", [28, 29, 55, 90])
+def test_strips_give_what_the_whole_picture_gives(monkeypatch, height):
+    """With 28 rows to a strip, four times the reach of 7."""
+    pictures = np.random.default_rng(6).standard_normal((2, height, 20)).astype(np.float32)
+    whole = GOOD.log_odds(pictures)
+    monkeypatch.setattr("detectors.methods.network.STRIP_PIXELS", 1)
+    np.testing.assert_allclose(GOOD.log_odds(pictures), whole, rtol=1e-5, atol=1e-4)
+
+
 def test_a_network_comes_back_from_its_file(tmp_path):
     write_network(tmp_path / "n.npz", GOOD)
     again = read_network(tmp_path / "n.npz")
