@@ -22,6 +22,7 @@ GROUP = "tofpod.detectors"
 
 BUILT_IN = {
     "fpfh_memory": "detectors.methods.peers:FpfhMemoryDetector",
+    "learned": "detectors.methods.learned:LearnedDetector",
     "local": "detectors.methods.local:LocalDetector",
     "m3c2": "detectors.methods.peers:M3c2Detector",
     "matched": "detectors.methods.matched:MatchedDetector",

@@ -127,6 +127,11 @@ PROGRAMS = (
         "builds a target, prints its truth, and writes its mesh and truth",
     ),
     ProgramEntry(
+        "train",
+        "harness.programs.train.train",
+        "trains the network of the detector `learned` on simulated boards",
+    ),
+    ProgramEntry(
         "validate",
         "harness.programs.scorecard.validate",
         "compares the simulated cameras with published figures, or with a real capture",

@@ -26,6 +26,8 @@ import pytest
 import trimesh
 
 import tofpod
+from detectors.methods.learned import SHIPPED
+from detectors.methods.network import read_network
 from harness.__main__ import MODULES, main
 from harness.experiment.load import load_experiment
 from harness.vocabulary.geometry import MM, Cloud, Lens
@@ -104,6 +106,17 @@ def test_the_documented_detector_keeps_the_contract(monkeypatch):
         tests["test_contract"]()
 
 
+def test_the_documented_network_is_a_detector(monkeypatch, tmp_path):
+    casting = types.ModuleType("acme_inspection.casting")
+    casting.__file__ = str(tmp_path / "casting.py")
+    shutil.copy(SHIPPED, tmp_path / "casting.npz")
+    monkeypatch.setitem(sys.modules, "acme_inspection.casting", casting)
+    exec(block_of("docs/extending.md", "# acme_inspection/casting.py"), casting.__dict__)
+    detector = casting.CastingDetector(casting.CastingConfig.from_data({}))
+    assert detector.settings.network == str(tmp_path / "casting.npz")
+    assert detector.network.facts == read_network(SHIPPED).facts
+
+
 def test_the_documented_gate_is_a_valid_study(tmp_path):
     (tmp_path / "limit.yaml").write_text(block_of("docs/ci_gate.md", "# tests/limit.yaml"))
     experiment = load_experiment(tmp_path / "limit.yaml", ("detector.name=thesis",))
@@ -141,6 +154,12 @@ SMALL = {
         "sweep={source.camera.name: [azure_kinect_nfov, pmd_flexx2]}",
     ),
     "pipe": (*SMALL_STUDY[:3], "source.render={bounces: 0}"),
+    "training": (
+        "study.boards=2",
+        "study.units=2",
+        "source.render={bounces: 0}",
+        "sweep={capture.frames: [1]}",
+    ),
     "averaging": (*SMALL_REPEATS, "sweep={capture.frames: [1, 5]}"),
     "cameras": (*SMALL_REPEATS, "sweep={source.camera.name: [azure_kinect_nfov, kinect_v2]}"),
     "anatomy": (
@@ -157,6 +176,7 @@ MORE = {
     "design": ("--studies", "20"),
     "dataset": ("--serial", "--boards", "10"),
     "sweep": ("--serial",),
+    "train": ("--serial", "--passes", "1", "--channels", "2"),
     "efficiency": ("--serial",),
 }
 
@@ -166,7 +186,7 @@ def shrunk(name: str, given: list[str]) -> list[str]:
     later and counts."""
     small = (
         SMALL.get(Path(given[0]).stem, ())
-        if name in ("sweep", "export", "dataset", "coverage")
+        if name in ("sweep", "export", "dataset", "coverage", "train")
         else ()
     )
     settings = [word for change in small for word in ("--set", change)]

@@ -214,6 +214,19 @@ def inverse_times(
     return solution
 
 
+def root_times(values: np.ndarray, by: Filters) -> np.ndarray:
+    """Return C^1/2 times values (r, c) that are 0 where nothing is known, for the `filters` of C.
+
+    Of C^-1 r it makes C^-1/2 r: white noise of deviation 1, away from unknown pixels and but for
+    frequencies at which the spectrum is raised to its least value."""
+    height, width = values.shape
+    padded = np.zeros_like(by.power)
+    padded[:height, :width] = values
+    # the factors contain the size of the grid once, as the inverse transform needs it
+    root = np.sqrt(by.power / np.float32(by.power.size))
+    return _filtered(padded, root, padded)[:height, :width].copy()
+
+
 def _filtered(
     image: np.ndarray,
     factors: np.ndarray,

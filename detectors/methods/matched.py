@@ -83,6 +83,17 @@ class MatchedConfig(FilterConfig):
     sizes."""
 
 
+class Whitened(NamedTuple):
+    """A picture of residuals whose noise is independent from pixel to pixel."""
+
+    values: np.ndarray
+    """(r, c) float32: C^-1/2 r, in deviations; beside unknown pixels its noise differs from 1."""
+    known: np.ndarray
+    """(r, c) bool."""
+    unit_m: np.ndarray
+    """(r, c): deviation of the residuals nearby, metres."""
+
+
 class MatchedDetector(LocalDetector):
     """A bank of matched filters on noise that the capture itself whitens; findings are peaks."""
 
@@ -133,6 +144,22 @@ class MatchedDetector(LocalDetector):
             " narrowest"
         )
         return signed, depth_m, unit
+
+    def whitened(
+        self,
+        residual_m: np.ndarray,
+        weights: np.ndarray,
+        rounding_m2: tuple[float, float],
+    ) -> Whitened:
+        """Return residuals (r, c), with weights (r, c), 0 where unknown, as independent noise."""
+        residuals = _in_deviations(residual_m, weights, rounding_m2)
+        covariance = self._covariance
+        if covariance is None:
+            covariance = _covariance(residuals)
+        known = residuals.known
+        filters = whitening.filters(covariance, known.shape)
+        solved = whitening.inverse_times(_tamed(residuals.values), known, filters)
+        return Whitened(whitening.root_times(solved, filters), known, residuals.unit_m)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the

@@ -20,7 +20,15 @@ from scenes.sensor import camera as cameras
 from scenes.sensor.camera import CAMERA_FOLDER, camera_file, camera_names, load_camera
 from tests.support.plug_in_packages import offer
 
-OWN_DETECTORS = ("fpfh_memory", "local", "m3c2", "matched", "plane_ransac", "thesis")
+OWN_DETECTORS = (
+    "fpfh_memory",
+    "learned",
+    "local",
+    "m3c2",
+    "matched",
+    "plane_ransac",
+    "thesis",
+)
 
 
 MINE = f"{__name__}:Mine"

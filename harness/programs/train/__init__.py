@@ -1,0 +1,1 @@
+"""`tofpod train`: the network of the detector `learned`, trained on simulated boards."""
