@@ -72,6 +72,33 @@ def findings_at(
     return [Findings.of(detector.find(cloud, evidence, threshold)) for threshold in thresholds]
 
 
+LEVELS = np.linspace(0.4, 0.95, 12)
+"""Thresholds, as shares of the lowest at which nothing is found, at which peaks are sought."""
+
+
+def highest_peaks(
+    detector: Detector,
+    cloud: Cloud,
+    evidence: Evidence,
+    *,
+    quiet_threshold: float,
+    count: int,
+) -> tuple[float, ...]:
+    """Return the scores of the strongest findings, highest first: at most ``count``, at the
+    highest of `LEVELS` with so many findings. ``quiet_threshold``: at which there is none."""
+    if not quiet_threshold > 0:
+        return (quiet_threshold,)
+    levels = (quiet_threshold * LEVELS).tolist()
+    strongest: tuple[float, ...] = (quiet_threshold,)
+    for findings in reversed(findings_at(detector, cloud, evidence, levels)):
+        scores = np.sort(findings.scores)[::-1]
+        if len(scores) > len(strongest):
+            strongest = tuple(scores[:count].tolist())
+        if len(scores) >= count:
+            break
+    return strongest
+
+
 def above(evidence: Evidence, threshold: float) -> np.ndarray:
     """Return the flat indices, ascending, of the pixels whose score exceeds the threshold."""
     with np.errstate(invalid="ignore"):

@@ -50,6 +50,9 @@ class RunRow:
     role: BoardRole
     threshold: Annotated[float, "threshold in use; empty in calibration runs"]
     quiet_threshold: Annotated[float, "hole-free boards: score above which nothing is found"]
+    peaks: Annotated[
+        list[float] | None, "in a study's calibration: scores of the strongest findings"
+    ] = None
     scale_mm: Annotated[float, "residual per unit of score"]
     surface_noise_mm: Annotated[
         float, "robust deviation from the fitted surface on the undamaged face"

@@ -76,11 +76,11 @@ def _choice_note(statement: PodStatement) -> str:
         "The models are sorted by deviance; a smaller deviance means a better fit. Unless a model"
         " was requested, the deviance selects the curve, but never the limit."
     )
-    if len(statement.fits) > 1:
+    if statement.average:
         text += (
-            f" {len(statement.fits)} models are within {NEAR_DEVIANCE:g} of the least (for each"
-            " inspection of a target), too little to distinguish them: each a90/95 to quote is the"
-            " largest of these models, and the band covers all their bands."
+            f" {len(statement.fits)} of the models are within {NEAR_DEVIANCE:g} of the least (for"
+            " each inspection of a target), too little to distinguish them: a90/95 and the band are"
+            " those of their average, weighted by likelihood."
         )
     return text
 
@@ -117,7 +117,7 @@ def pod_parts(statement: PodStatement) -> list[str | Grid]:
 def sizes_grid(statement: PodStatement) -> Grid:
     """Return the table of a50, a90 and a90/95 with the method of each."""
     models = len(statement.fits)
-    of_models = f", the largest of {models} models" if models > 1 else ""
+    of_models = f" ({models} of {len(statement.models)})" if statement.average else ""
     digits = _digits(statement)
     unit = statement.unit
     rows = [

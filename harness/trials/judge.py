@@ -20,6 +20,7 @@ from detectors.interface import (
     NeedsTruth,
     TrueDamage,
 )
+from detectors.levels import highest_peaks
 from detectors.pixels.masks import grown
 from detectors.pixels.noise import median_of, sigma_of
 from detectors.score_map import Findings, findings_at
@@ -28,6 +29,7 @@ from harness.trials.board import LabelledCloud, highest_within
 from scenes.target.flaws import from_line_m
 from scenes.target.truth import Damage
 
+PEAKS = 10  # number of findings of a hole-free board that set a threshold
 # an outline is grown by half of a camera's window before detections are compared with it
 SMEARED_PX = 2
 STEPS_PER_OCTAVE = 4
@@ -146,6 +148,18 @@ class Judgement:
             matches = _matched(self.labelled, levels, *rule)
             hits = [len(pairs) for pairs, _ in matches]
         return thresholds, [len(level.scores) for level in levels], hits
+
+    @cached_property
+    def peaks(self) -> tuple[float, ...]:
+        """Scores of the strongest findings on a board without damage, highest first; at most
+        `PEAKS`."""
+        return highest_peaks(
+            self.detector,
+            self.labelled.cloud,
+            self.evidence,
+            quiet_threshold=self.quiet_threshold,
+            count=PEAKS,
+        )
 
     @cached_property
     def pixel_thresholds(self) -> np.ndarray:

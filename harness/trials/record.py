@@ -91,6 +91,7 @@ def run_row(
         return row
     row = replace(row, inspected_m2=judgement.inspected_m2)
     if threshold is None:
+        row = replace(row, peaks=list(judgement.peaks))
         return _with_loudest_place(row, judgement)
     _, no_return_calls = judgement.without_return
     return replace(row, no_return_calls=no_return_calls)

@@ -23,6 +23,7 @@ if __name__ == "__main__":
 from scipy import optimize, special
 
 from harness.evaluation.intervals import percentiles
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
 from harness.evaluation.study.boards import design_effect, refitted_sizes, targets_of
 from harness.vocabulary.errors import UserError
@@ -94,7 +95,7 @@ def coverage(boards: int, shift_mm: float, studies: int, seed: int) -> Coverage:
         targets = targets_of(board, hole, size, hit)
         drawn = refitted_sizes(targets, fit.curve, (0.9,), DRAWS)[0]
         effect = design_effect(targets, fit.curve, 0.9)
-        with_effect = bound(fit, design_effect=max(effect, 1.0))
+        with_effect = ModelAverage([fit], max(effect, 1.0)).bound()
         rows.append((bound(fit).value, with_effect.value, percentiles(drawn, 0.9).high, effect))
     ratio, of_boards, percentile, effects = np.array(rows).T
     return Coverage(

@@ -11,8 +11,8 @@ chance or misses at any size, for which `floor_ceiling_tests` tests.
 
 The bound of a model holds if that model is true. If the data choose among eight models, the bound
 of the best model covers 91 to 96 % (1,000 studies of 60 targets for each of five true curves). So
-`largest_bound` takes the largest of all models that the data hardly distinguish from the best
-(`near_models`): 95.6 to 99 % (``tests/validation/pod_coverage.py``)."""
+where the data choose, `harness.evaluation.pod.averaged` averages over all models that the data
+hardly distinguish from the best (`near_models`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -434,15 +434,12 @@ def bound(
     fit: HitMissFit,
     pod: float = 0.9,
     confidence: float = 0.95,
-    *,
-    design_effect: float = 1.0,
 ) -> Bound:
     """Return the upper bound on the size with this POD; infinite, with the reason, if there is
-    none. ``design_effect``: factor of variance and criterion for targets in clusters (Rao and
-    Scott, Annals of Statistics 12 (1984), 46)."""
+    none."""
     if not 0 < pod < 1:
         raise UserError(f"POD {pod:g} is out of range", legal="between 0 and 1")
-    x, why = _likelihood_bound(fit, pod, criterion(confidence) * design_effect * fit.repeats)
+    x, why = _likelihood_bound(fit, pod, criterion(confidence) * fit.repeats)
     with np.errstate(over="ignore"):
         value = float(np.exp(x)) if fit.curve.log_size else x
     if not np.isfinite(value):
@@ -466,14 +463,6 @@ def band(
     low = link_cdf(fit.curve.link, predictors.min(axis=0))
     high = link_cdf(fit.curve.link, predictors.max(axis=0))
     return low, high
-
-
-def largest_bound(fits: Sequence[HitMissFit], design_effects: Sequence[float] = ()) -> Bound:
-    """Return the largest a90/95 of several models; infinite if any of them has none.
-    ``design_effects``: by model."""
-    effects = design_effects or [1.0] * len(fits)
-    bounds = [bound(fit, design_effect=effect) for fit, effect in zip(fits, effects, strict=True)]
-    return max(bounds, key=lambda limit: limit.value)
 
 
 def criterion(confidence: float) -> float:

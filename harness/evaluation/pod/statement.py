@@ -20,6 +20,7 @@ from harness.evaluation.pod.ahat import (
     choose_axes,
     diagnose,
 )
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, Beyond, HitMissFit
 from harness.evaluation.pod.inspections import Inspections
@@ -62,7 +63,7 @@ class ModelRow:
     chosen: bool
     """True if it is the curve that is stated."""
     in_bound: bool
-    """True if its bound is among those of which the statement's bound is the largest."""
+    """True if the statement's bound and band are of this model, alone or among others."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,10 @@ class PodStatement:
     unit: str
     """Unit of sizes; may be empty."""
     fits: tuple[HitMissFit, ...]
-    """Models of hits whose largest bound and widest band are stated, that of the curve first;
-    empty for signals."""
+    """Models of hits that fit about equally well, that of the curve first; empty for signals."""
+    average: ModelAverage | None
+    """Their average, of which bound and band are; None for a model that the user states, and for
+    signals."""
     signal: AhatFit | None
     """The regression of signals; None for hits."""
     models: tuple[ModelRow, ...]
@@ -117,11 +120,9 @@ class PodStatement:
         long."""
         if self.signal:
             return ahat_band(self.signal, self.sizes, CONFIDENCE)
-        # the envelope of the models: its lower edge crosses 90 % at their `largest_bound`
-        bands = [hit_miss.band(fit, self.sizes) for fit in self.fits]
-        low = np.min([low for low, _ in bands], axis=0)
-        high = np.max([high for _, high in bands], axis=0)
-        return low, high
+        if self.average:
+            return self.average.band(self.sizes)
+        return hit_miss.band(self.fits[0], self.sizes)
 
     @property
     def model(self) -> str:
@@ -221,9 +222,10 @@ def state_hits(
     tested: bool = True,
 ) -> PodStatement:
     """State the curve of hits and misses: the fit with the least deviance, over all links and over
-    sizes or their logarithms, unless ``link`` or ``log_size`` restricts them. The bound is the
-    largest over the `near_models` among these fits. ``tested``: whether to test for hits by chance
-    and misses at any size, which takes most of the time."""
+    sizes or their logarithms, unless ``link`` or ``log_size`` restricts them. The bound is that of
+    the average over the `near_models` among these fits, or the handbook's likelihood ratio bound
+    if the user states both. ``tested``: whether to test for hits by chance and misses at any size,
+    which takes most of the time."""
     size = read.size
     # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of
     # 0.6 s on busy cores
@@ -238,8 +240,10 @@ def state_hits(
         close_fits = hit_miss.near_models(allowed)
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
         bounds = [hit_miss.bound(fit, POD, CONFIDENCE) for fit in tried]
-    of_near = [limit for fit, limit in zip(tried, bounds, strict=True) if fit in close_fits]
-    limit = max(of_near, key=lambda limit: limit.value)
+        average: ModelAverage | None = None
+        if len(allowed) > 1:
+            average = ModelAverage(close_fits)
+        limit = average.bound(POD) if average else bounds[tried.index(fit)]
 
     notes = [*read.notes, *fit.notes]
     if fit.targets < LEAST_TARGETS:
@@ -276,6 +280,7 @@ def state_hits(
         kind="hit/miss",
         unit=unit,
         fits=close_fits,
+        average=average,
         signal=None,
         models=_models(tried, bounds, close_fits),
         bound=limit,
@@ -339,6 +344,7 @@ def state_signals(
         kind="signal against size",
         unit=unit,
         fits=(),
+        average=None,
         signal=fit,
         models=_models(tried, bounds, (fit,)),
         bound=ahat_bound(fit, POD, CONFIDENCE),

@@ -1,12 +1,11 @@
 """The detection limit of one set-up: a90/95, and its bound over resampled boards.
 
-The quoted limit is the likelihood ratio bound of the hit/miss curve, the largest over models that
-fit about equally well (`harness.evaluation.pod.statement.state_hits`). It takes damages as
-independent targets, which damages of one board are not quite; so a second bound multiplies the
-criterion by the boards' design effect. If the a50 of boards scatters by 2 mm about 6 mm, a90/95 of
-the true model covers 88 % (60 boards) and 91 % (20), the second bound 93 % and 95 %; if boards do
-not matter, both cover 95 to 97 %. The upper percentile over resampled boards does not replace it:
-it covers 86 % with 20 boards (300 studies, ``tests/validation/study_coverage.py``)."""
+The quoted limit is the bound of the hit/miss curves that fit about equally well, averaged
+(`harness.evaluation.pod.averaged`). It takes damages as independent targets, which damages of one
+board are not quite; so a second bound divides their log-likelihoods by the boards' design effect.
+The upper percentile over resampled boards does not replace it: where the a50 of boards scatters by
+2 mm about 6 mm, it covers 86 % with 20 boards. ``tofpod audit`` measures how often all of these
+cover."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +19,9 @@ from harness.evaluation.intervals import (
     false_call_rate,
     percentiles,
 )
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import Bound
-from harness.evaluation.pod.hit_miss import METHOD, largest_bound
+from harness.evaluation.pod.hit_miss import METHOD
 from harness.evaluation.pod.inspections import Inspections
 from harness.evaluation.pod.statement import CONFIDENCE, POD, PodStatement, state_hits
 from harness.evaluation.study.boards import (
@@ -259,15 +259,14 @@ def _sizes_of_curve(
 
 
 def _over_boards(statement: PodStatement, targets: Targets) -> tuple[Bound, float]:
-    """Return a90/95 with each model's design effect in its criterion, and that of the curve; an
-    effect below 1 counts as 1. Separated data have none."""
+    """Return a90/95 with the curve's design effect, which divides the log-likelihoods, and that
+    effect; one below 1 counts as 1. Separated data have none."""
     if statement.fits[0].method != "ML":
         return statement.bound, np.nan
-    effects = [design_effect(targets, fit.curve, POD) for fit in statement.fits]
-    at_least_one = [max(1.0, effect) for effect in effects]
-    if max(at_least_one) > 1:
-        return largest_bound(statement.fits, at_least_one), effects[0]
-    return statement.bound, effects[0]
+    effect = design_effect(targets, statement.curve, POD)
+    if effect > 1:
+        return ModelAverage(statement.fits, effect).bound(POD), effect
+    return statement.bound, effect
 
 
 def _sizes_if_all_found(targets: Targets, draws: int) -> _Sizes:

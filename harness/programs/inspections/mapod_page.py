@@ -80,7 +80,7 @@ def notes(mapod: Mapod) -> list[str]:
         f"factor {PRIOR_SIZE:g} in k and {PRIOR_WIDTH:g} in w, plus the simulated curve's own "
         "uncertainty; w is below 1 only within that uncertainty.",
         "Combined: medians of the posterior, and its 97.5 % quantile for a90/95 (for simulated "
-        "and for measured hits, a90/95 is the handbook's likelihood ratio bound); the largest "
+        "and for measured hits alone, a90/95 is averaged over models); the largest "
         "over the models that fit the simulated hits about equally well. If the simulation is "
         "contradicted, the larger of combined and measured limit counts.",
         "If the simulated curve were right, hits and misses at least as far from it would occur "

@@ -206,7 +206,7 @@ def test_every_number_of_a_limit_stands_in_its_file(
     assert first["targets"] == limit.targets
     assert first["boards"] == limit.boards
     assert first["hits"] == limit.hits
-    assert first["a90_95_method"] == "likelihood ratio"
+    assert first["a90_95_method"] == "average over models"
     assert list(frame["a90_95_verdict"]) == ["demonstrated", "demonstrated", "not demonstrated"]
     assert np.isnan(frame["a90_95_mm"].iloc[2])
 

@@ -25,7 +25,6 @@ from harness.evaluation.pod.hit_miss import (
     criterion,
     fit_hit_miss,
     floor_ceiling_tests,
-    largest_bound,
     rows_of_target,
     value_and_gradient,
 )
@@ -229,18 +228,6 @@ def test_the_band_of_a_small_study_holds_all_curves_of_the_likelihood_ratio_set(
     low, high = band(fit, at_mm)
     assert low == pytest.approx(link_cdf(link, predictors.min(axis=0)), abs=0.02)
     assert high == pytest.approx(link_cdf(link, predictors.max(axis=0)), abs=0.02)
-
-
-def test_the_largest_bound_is_over_models_with_their_effects() -> None:
-    sizes, hits = simulated(60, seed=5)
-    fits = [fit_hit_miss(sizes, hits, link=link) for link in ("logit", "cloglog", "loglog")]
-    alone = [bound(fit).value for fit in fits]
-    assert largest_bound(fits).value == max(alone)
-    narrow = int(np.argmin(alone))
-    effects = [6.0 if number == narrow else 1.0 for number in range(3)]
-    widened = bound(fits[narrow], design_effect=6.0).value
-    assert largest_bound(fits, effects).value == max(widened, *alone)
-    assert widened > max(alone)
 
 
 def test_rows_of_a_target_are_counted_wherever_they_stand() -> None:

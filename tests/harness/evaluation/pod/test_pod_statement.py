@@ -11,6 +11,7 @@ from scipy import stats
 
 from harness.evaluation.pod import statement
 from harness.evaluation.pod.ahat import ahat_bound, choose_axes, diagnose
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import link_cdf
 from harness.evaluation.pod.hit_miss import (
     _search,
@@ -19,7 +20,6 @@ from harness.evaluation.pod.hit_miss import (
     choose_model,
     fit_hit_miss,
     floor_ceiling_tests,
-    largest_bound,
     near_models,
 )
 from harness.evaluation.pod.inspections import Inspections
@@ -123,25 +123,39 @@ def test_a_floor_that_the_data_suggest_is_doubted() -> None:
 # hits and misses
 
 
-def test_the_bound_is_the_largest_and_the_band_the_widest_of_near_models() -> None:
+def test_bound_and_band_are_those_of_the_average_of_near_models() -> None:
     read = hits_of(60, NEAR_SEED)
     stated = state_hits(read, unit="mm")
     tried = choose_model(read.size, read.response)
     near_fits = near_models(tried)
     assert 1 < len(near_fits) < len(tried)
     assert [fit.deviance for fit in stated.fits] == [fit.deviance for fit in near_fits]
-    assert stated.bound == largest_bound(near_fits)
-    assert stated.bound.value == max(bound(fit).value for fit in near_fits)
+    average = ModelAverage(near_fits)
+    assert stated.bound == average.bound()
+    assert stated.bound.method == "average over models"
     assert stated.a50 == near_fits[0].curve.size_at(0.5)
     assert stated.a90 == near_fits[0].curve.size_at(0.9)
-    bands = [band(fit, stated.sizes) for fit in near_fits]
     low, high = stated.band
-    assert np.array_equal(low, np.min([edges[0] for edges in bands], axis=0))
-    assert np.array_equal(high, np.max([edges[1] for edges in bands], axis=0))
+    average_low, average_high = average.band(stated.sizes)
+    assert np.array_equal(low, average_low)
+    assert np.array_equal(high, average_high)
     deviances = [fit.deviance for fit in near_fits]
     assert [row.in_bound for row in stated.models] == [fit.deviance in deviances for fit in tried]
     assert [row.chosen for row in stated.models] == [True] + 7 * [False]
     assert stated.counts == f"60 inspections of 60 targets, {int(read.response.sum())} hits"
+
+
+def test_a_stated_model_has_the_handbooks_bound_and_band() -> None:
+    read = hits_of(60, NEAR_SEED)
+    stated = state_hits(read, link="probit", log_size=True, tested=False)
+    fit = fit_hit_miss(read.size, read.response, link="probit", log_size=True)
+    assert stated.average is None
+    assert stated.bound == bound(fit)
+    assert stated.bound.method == "likelihood ratio"
+    low, high = stated.band
+    fit_low, fit_high = band(fit, stated.sizes)
+    assert np.array_equal(low, fit_low)
+    assert np.array_equal(high, fit_high)
 
 
 def test_near_models_are_within_two_of_the_least_deviance_per_inspection() -> None:
@@ -150,14 +164,6 @@ def test_near_models_are_within_two_of_the_least_deviance_per_inspection() -> No
     assert near_models([fit, *worse]) == (fit, worse[0])
     thrice = [replace(worse_fit, repeats=3.0) for worse_fit in (fit, *worse)]
     assert len(near_models(thrice)) == 3
-
-
-def test_a_design_effect_multiplies_the_criterion() -> None:
-    fit = fit_hit_miss(*_columns(hits_of(60, 5)))
-    by_confidence = float(stats.chi2.cdf(1.5 * stats.chi2.ppf(0.95, 1), 1))
-    wider = bound(fit, design_effect=1.5).value
-    assert wider == pytest.approx(bound(fit, confidence=by_confidence).value, rel=1e-9)
-    assert largest_bound([fit, fit], [1.0, 1.5]).value == wider
 
 
 def test_the_numbers_of_a_fit_are_named() -> None:
@@ -332,7 +338,7 @@ def test_a_statement_as_plain_data() -> None:
     assert data["a90_95"] == {
         "pod": 0.9,
         "confidence": 0.95,
-        "method": "likelihood ratio",
+        "method": "average over models",
         "demonstrated": True,
         "why": "",
         "size": stated.bound.value,

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.evaluation.intervals import percentiles
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import CELLS, LINKS, PodCurve
-from harness.evaluation.pod.hit_miss import bound, choose_model, fit_hit_miss
+from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss
 from harness.evaluation.study.boards import (
     design_effect,
     refitted_sizes,
@@ -76,9 +77,7 @@ class TestDepth:
 
 
 class TestHeadline:
-    def test_is_the_largest_bound_of_the_models_near_the_one_of_least_deviance(
-        self,
-    ):
+    def test_is_the_average_of_the_models_near_the_one_of_least_deviance(self):
         record = set_up(Study(boards=15, hole_free_boards=12, seed=6))
         limit = limit_of(record)
         inspected = record.inspected
@@ -88,7 +87,7 @@ class TestHeadline:
             fit.curve.link for fit in near_fits
         ]
         assert 1 < len(near_fits) < len(fits)
-        assert limit.a90_95.value == max(bound(fit).value for fit in near_fits) > bound(best).value
+        assert limit.a90_95 == ModelAverage(near_fits).bound()
         assert limit.a50_mm == best.curve.size_at(0.5)
         assert limit.a90_mm == best.curve.size_at(0.9)
         assert limit.why == ""
@@ -109,7 +108,7 @@ class TestHeadline:
         near_fits = [
             fit for fit in by_hand if fit.deviance <= by_hand[0].deviance + 2 * 3
         ]  # every target counts thrice
-        assert limit.a90_95.value == max(bound(fit).value for fit in near_fits)
+        assert limit.a90_95 == ModelAverage(near_fits).bound()
 
     def test_is_near_the_truth(self):
         answers = SetUp()
@@ -416,17 +415,13 @@ class TestBoardsDrawnAgain:
             spreads.append(refitted_sizes(targets, curve, (0.9,), 100)[0].std())
         assert np.mean(spreads) == pytest.approx(np.std(estimates), rel=0.25)
 
-    def test_the_bound_over_boards_has_the_effect_in_its_criterion(self):
+    def test_the_bound_over_boards_divides_the_log_likelihoods_by_the_effect(self):
         limit = limit_of(set_up(Study((SetUp(boards_mm=3.0),), boards=30)))
         inspected = limit.record.inspected
         targets = targets_of(inspected.board, inspected.hole, inspected.diameter_mm, inspected.hit)
-        effects = [design_effect(targets, fit.curve, 0.9) for fit in limit.statement.fits]
-        assert effects[0] == limit.design_effect > 1.3
-        bounds = [
-            bound(fit, design_effect=effect)
-            for fit, effect in zip(limit.statement.fits, effects, strict=True)
-        ]
-        assert limit.over_boards.value == max(limit_of_model.value for limit_of_model in bounds)
+        effect = design_effect(targets, limit.statement.curve, 0.9)
+        assert effect == limit.design_effect > 1.3
+        assert limit.over_boards == ModelAverage(limit.statement.fits, effect).bound()
         assert limit.over_boards.value > limit.a90_95.value
         calm = limit_of(set_up(Study(boards=30, hole_free_boards=0, seed=3)))
         assert calm.design_effect <= 1
