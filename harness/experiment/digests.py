@@ -17,6 +17,8 @@ ONLY_OF_CAPTURES = ("detectors/recordings",)
 ONLY_OF_SEVERAL_VIEWS = ("detectors/views",)
 EXPERIMENT = "experiment "
 """Begins the name of the part that stands for an experiment's own settings."""
+CAMERA_PART = "camera "
+"""Begins the name of the part that stands for a camera's numbers."""
 NO_NUMBERS = ("name", "title")
 """Keys of an experiment on which no number hangs."""
 
@@ -60,7 +62,7 @@ def camera_digests(names: Iterable[str]) -> Digests:
     digests = {}
     for name in sorted(names):
         numbers = _values(load_camera(name).to_data())
-        digests[f"camera {name}"] = digest(numbers)[:DIGITS]
+        digests[f"{CAMERA_PART}{name}"] = digest(numbers)[:DIGITS]
     return digests
 
 

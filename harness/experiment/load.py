@@ -11,7 +11,6 @@ from typing import Any
 from harness.experiment import checks
 from harness.experiment.schema import (
     DETECTOR_SETTINGS,
-    UNKNOWNS,
     Experiment,
     ValuesVariation,
     declared_of,
@@ -29,6 +28,7 @@ from harness.vocabulary.declaration.yaml_source import (
 )
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
+from harness.vocabulary.path_names import UNKNOWNS
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
 from scenes.sensor.common.config import CameraConfig

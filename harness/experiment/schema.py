@@ -25,6 +25,7 @@ from harness.vocabulary.declaration import shape
 from harness.vocabulary.declaration.yaml_source import Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest, inside
+from harness.vocabulary.path_names import UNKNOWNS
 from harness.vocabulary.seeds import digest
 from scenes.optics import RenderConfig
 from scenes.perspectives import AnyViews
@@ -296,8 +297,6 @@ def declared_of(data: Any) -> shape.Declared:
     return shape.Declared(ExperimentConfig, data, splices_of(data))
 
 
-UNKNOWNS = "unknowns"
-"""Axis of a study with unknowns: whether its boards have the stated values or drawn ones."""
 STATED = "stated"
 DRAWN = "drawn"
 MAIN = "main"  # The set-up of an experiment without axes other than the number of frames

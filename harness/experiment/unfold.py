@@ -15,7 +15,6 @@ from harness.experiment.schema import (
     MAIN,
     SHARED_BY_POINTS,
     STATED,
-    UNKNOWNS,
     ExperimentConfig,
     Point,
     SimulatedSource,
@@ -34,7 +33,13 @@ from harness.vocabulary.declaration.yaml_source import (
     parse_yaml,
 )
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.path_names import differing, names_of, on_one_line, value_text
+from harness.vocabulary.path_names import (
+    UNKNOWNS,
+    differing,
+    names_of,
+    on_one_line,
+    value_text,
+)
 from harness.vocabulary.seeds import canonical_json, random_stream
 from harness.vocabulary.words import nearest
 from scenes.sensor.camera import camera_of

@@ -7,12 +7,13 @@ values, whatever n is, and another unknown or a further board changes no value.
 
 Not modelled: unknowns that hang together (a dark paint that is also glossy)."""
 
+from collections import Counter
 from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from harness.vocabulary.config import Config
-from harness.vocabulary.seeds import random_stream
+from harness.vocabulary.seeds import canonical_json, random_stream
 
 PARTS = 6
 """Number of equal parts of a range that a block of boards has once each."""
@@ -49,6 +50,12 @@ class UnknownConfig(Config):
             raise ValueError(f"`{self.key}` is no fact of source.target or source.camera")
         if any(self.key == key or self.key.startswith(f"{key}.") for key in CHOSEN):
             raise ValueError(f"`{self.key}` is chosen and cannot be unknown")
+        texts = Counter(canonical_json(value) for value in self.values or ())
+        repeated = [text for text, count in texts.items() if count > 1]
+        if repeated:
+            raise ValueError(
+                f"`values` repeat {', '.join(repeated)}: equally probable values stand once each"
+            )
         return self
 
     @property

@@ -13,10 +13,13 @@ from harness.evaluation.study.unknowns import UnknownEffect
 from harness.records.schema import Column, Estimate, Table
 from harness.tables.limits import SET_UP
 from harness.vocabulary import text
-from harness.vocabulary.path_names import names_of, on_one_line, unit_of, value_text
-
-AXIS = "unknowns"
-"""The axis of a study that says whether a set-up's unknowns are drawn."""
+from harness.vocabulary.path_names import (
+    UNKNOWNS,
+    names_of,
+    on_one_line,
+    unit_of,
+    value_text,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +163,7 @@ def stated_of(result: StudyResult, drawn: SetUpLimit) -> SetUpLimit | None:
 
 def _axes_but_unknowns(limit: SetUpLimit) -> dict[str, Any]:
     """Return a set-up's values of all axes but that of unknowns."""
-    return {name: value for name, value in limit.record.axes.items() if name != AXIS}
+    return {name: value for name, value in limit.record.axes.items() if name != UNKNOWNS}
 
 
 def unknown_sentences(result: StudyResult) -> list[str]:
@@ -188,7 +191,7 @@ def _sentence(result: StudyResult, set_up: SetUpResult) -> str:
     limit = set_up.limit
     unknowns = set_up.unknowns
     assert unknowns is not None
-    label = limit.record.label.replace(f"{AXIS} drawn, ", "")
+    label = limit.record.label.replace(f"{UNKNOWNS} drawn, ", "")
     stated = stated_of(result, limit)
     parts = [f"{_size(limit, limit.a90_mm)} over the unknowns (drawn for each board)"]
     if stated is not None:
@@ -219,7 +222,7 @@ def _size(limit: SetUpLimit, size_mm: float) -> str:
 
 def undetermined(facts: Any) -> tuple[str, ...]:
     """Return a sentence on each unknown that an experiment declares, from its plain data."""
-    unknowns = facts.get(AXIS) or ()
+    unknowns = facts.get(UNKNOWNS) or ()
     names = names_of([unknown["key"] for unknown in unknowns])
     sentences = []
     for unknown in unknowns:

@@ -26,6 +26,9 @@ CHOICES = (
     "method",
 )  # keys that select one of several kinds of what the key before them names
 NAMED = ("camera", "detector", "damage")  # axes whose values explain themselves
+UNKNOWNS = "unknowns"
+"""Key of an experiment's unknowns, and axis of such a study: whether its boards have the stated
+values or drawn ones."""
 LONGEST = 60  # Characters of a value that a table can show
 
 

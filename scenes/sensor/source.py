@@ -60,6 +60,13 @@ class SimulatedUnit:
         return float(shares[self.cut].mean())
 
     @cached_property
+    def jitter_mm(self) -> float:
+        """Deviation of the small displacement of every frame before this view."""
+        if isinstance(self.model, AmcwImager):
+            return self.model.jitter_mm(self.exposure)
+        return float(self.camera.unit.jitter_mm.value)
+
+    @cached_property
     def at_once(self) -> AtOnce | None:
         """Sums of frames of this view without drawing each; None if frames must be drawn, or for
         other kinds."""
@@ -133,7 +140,11 @@ class SimulatedCapture:
         config = self.unit.config
         stream = random_stream(self.seed, "frame errors", *self.labels)
         errors_m = frame_errors_m(
-            camera.unit, config.effects, config.minutes_since_power_on, stream
+            camera.unit,
+            config.effects,
+            minutes=config.minutes_since_power_on,
+            jitter_mm=self.unit.jitter_mm,
+            rng=stream,
         )
         return np.array(list(islice(errors_m, self.n_frames)))
 

@@ -377,8 +377,8 @@ def _spatial(checks: Sequence[WallCheck]) -> str:
 
 The table gives the correlation between the noise of pixels that are 1 to 5 px apart (the lag). Each real frame has a
 small range error that all its pixels share (jitter): the mean over all pixels of a wall varies from frame to frame by
-{real}. In the simulation it varies by {ours}. The size of the jitter in the camera's file was set from these frames, so
-this agreement is not a test. Independent pixels would give 0.03 mm. Jitter increases the correlation at all lags alike.
+{real}. In the simulation it varies by {ours}. The file's jitter was set from these frames, at the brightness that each
+wall's noise requires; with the brighter walls simulated here it is smaller. Independent pixels would give 0.03 mm. Jitter increases the correlation at all lags alike.
 "Jitter off" means that each frame's mean is subtracted: measured and simulated correlations then differ by at most
 {gaps[False]:.3f} at lags 1 to 5. With jitter they differ by at most {gaps[True]:.3f}."""
 
@@ -425,8 +425,9 @@ def _why(checks: Sequence[WallCheck]) -> str:
   0.29 mm of white noise. Where the simulated deviation is smaller than the real one, the share of this white noise is
   larger and the correlation lower.
 - **Real noise is correlated beyond the filter window.** Simulated noise within a frame is uncorrelated at 5 px; real
-  noise is still slightly correlated. In addition to jitter, which is modelled, real frames have an error that varies
-  smoothly within a frame and is not modelled.
+  noise is still slightly correlated. A frame's error is not the same for all pixels: parts of the walls whose ranges
+  differ by 0.6 m even err in opposite directions. [The cameras](cameras.md#jitter-of-frames) says what fits these
+  errors; the model displaces the frame as a whole.
 - **The fixed patterns agree: measured by simulated {times}.** The two sizes in the camera file were set from these
   frames, so this agreement is not a test. The white part was set from patches of 3 to 15 pixels, which require a
   smaller value than this analysis finds. The measured pattern contains the plaster's own relief and texture, and light

@@ -24,7 +24,7 @@ from harness.evaluation.study.record import SetUpRecord, StudyRecord
 from harness.evaluation.study.surface import PodSurface, surface_of
 from harness.evaluation.study.unknowns import OverUnknowns, over_unknowns
 from harness.records.trials import ResultTables
-from harness.vocabulary.path_names import camera_title, in_words
+from harness.vocabulary.path_names import UNKNOWNS, camera_title, in_words
 from harness.vocabulary.seeds import canonical_json
 
 if TYPE_CHECKING:
@@ -417,7 +417,7 @@ def conditions_of(facts: Mapping[str, Any], inspected: int | None = None) -> str
     damage = _damage_words(facts)
     conditions = [damage] if damage else []
     varied_paths = [*(facts.get("sweep") or {})]
-    varied_paths += [unknown["key"] for unknown in facts.get("unknowns") or ()]
+    varied_paths += [unknown["key"] for unknown in facts.get(UNKNOWNS) or ()]
     has_threshold = False
     for path, words in CONDITIONS:
         value = _value_at(facts, path)

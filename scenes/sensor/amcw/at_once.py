@@ -134,7 +134,8 @@ def at_once(imager: AmcwImager, exposure: AmcwExposure, pixels: np.ndarray) -> A
 
     # which pixels must be simulated one by one
     unit = imager.camera.unit
-    farthest_mm = unit.jump_mm.value + JITTERS * unit.jitter_mm.value + abs(unit.drift_mm.value)
+    jitter_mm = imager.jitter_mm(exposure)
+    farthest_mm = unit.jump_mm.value + JITTERS * jitter_mm + abs(unit.drift_mm.value)
     farthest_m = farthest_mm * MM
     certain = certainty(filtered, imager.engine, lost, shape, farthest_m)
     undecided = ~(certain.always | certain.never) & pixels.ravel()

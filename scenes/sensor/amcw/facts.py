@@ -26,6 +26,7 @@ from scenes.sensor.common.facts import (
     Share,
     ShareEach,
     SmoothPatternFacts,
+    UnitFacts,
     checked,
 )
 
@@ -388,11 +389,21 @@ class EngineFacts(LimitFacts):
         return self
 
 
+class AmcwUnitFacts(UnitFacts):
+    """Differences between units, and between frames."""
+
+    jitter_at_units: Positive | None = None
+    """Median over pixels of the sum of amplitudes at which frames have the jitter, which is
+    inversely proportional to it; None: the jitter is the same in any light."""
+
+
 class AmcwCamera(CameraFacts):
     """A continuous-wave time-of-flight imager: everything that its model needs, as data."""
 
     kind: Literal["amcw_imager"]
     """Chooses this model."""
+    unit: AmcwUnitFacts
+    """Differences between units, and between frames."""
     emitter: EmitterFacts
     """The light source."""
     scatter: ScatterFacts | None = None

@@ -36,6 +36,7 @@ from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of
 
 f4 = np.float32
 WIDE_PX = 1.5  # deviation from which samples of a Gaussian blur as it does, within 1 %
+LEAST_UNITS = 1.0  # sum of amplitudes of a view without light
 HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total
 
 
@@ -301,6 +302,32 @@ class AmcwImager(UnitModel[AmcwCamera]):
         nearest_m = np.where(np.isfinite(nearest_m), nearest_m, 0.0)
         range_m = np.where(view.coverage < 1, nearest_m, np.nan_to_num(view.range_m))
         return np.asarray(at_one_metre * self.gathered * intensity * range_m**2)
+
+    def jitter_mm(self, exposure: AmcwExposure) -> float:
+        """Return the deviation of a frame's displacement. Where the file states at which sum of
+        amplitudes it has that jitter, the jitter is inversely proportional to the median over the
+        view's pixels, as an offset that all samples of a frame share turns phasors by an angle that
+        is inversely proportional to their length.
+
+        Not modelled: such an offset moves near and far pixels differently, even in opposite
+        directions; the whole frame is displaced."""
+        unit = self.camera.unit
+        if unit.jitter_at_units is None:
+            return unit.jitter_mm.value
+        # a view that is too dark to have ranges counts as one that barely has them
+        faintest = max(self.camera.engine.min_amplitude_sum_units.value, LEAST_UNITS)
+        median = float(np.median(self.amplitude_sums(exposure)))
+        return unit.jitter_mm.value * unit.jitter_at_units.value / max(median, faintest)
+
+    def amplitude_sums(self, exposure: AmcwExposure) -> np.ndarray:
+        """Return each pixel's sum (n,) of amplitudes over the frequencies, without noise and before
+        the filter, in converter units."""
+        cosines = np.cos(self._phase_steps)
+        sines = np.sin(self._phase_steps)
+        re = np.einsum("fkn,k->fn", exposure.means, cosines)
+        im = np.einsum("fkn,k->fn", exposure.means, sines)
+        amplitudes = self.gains[:, None] * np.hypot(re, im) * 2 / len(cosines)
+        return np.asarray(amplitudes.sum(axis=0))
 
     def frame(
         self, exposure: AmcwExposure, rng: np.random.Generator, error_m: float = 0.0

@@ -196,22 +196,26 @@ def _drift_m(
 
 
 def frame_errors_m(
-    facts: UnitFacts, effects: EffectsConfig, minutes: float, rng: np.random.Generator
+    facts: UnitFacts,
+    effects: EffectsConfig,
+    minutes: float,
+    jitter_mm: float,
+    rng: np.random.Generator,
 ) -> Iterator[float]:
-    """Yield range errors in metres for endless frames: jitter in all, a jump either way in a few,
-    and the change of the drift on the axis since the first frame, ``minutes`` after power-on. An
-    effect that is off adds 0."""
+    """Yield range errors in metres for endless frames: jitter of deviation ``jitter_mm`` in all, a
+    jump either way in a few, and the change of the drift on the axis since the first frame,
+    ``minutes`` after power-on. An effect that is off adds 0."""
     axis = np.zeros(1)
     per_minute = facts.frames_per_second.value * 60
     first_m = _drift_m(facts, effects, minutes, axis)[0]
     for frame in count():
         now_m = _drift_m(facts, effects, minutes + frame / per_minute, axis)[0]
         drifted_m = float(now_m - first_m)
-        jitter_mm = rng.standard_normal() * facts.jitter_mm.value
+        jittered_mm = rng.standard_normal() * jitter_mm
         # a number from 0 to 1 is a jump; each half of them stands for one direction
         chance = rng.random() / max(facts.jump_rate.value, 1e-12)
         jump_mm = 0.0
         if chance < 1:
             jump_mm = math.copysign(facts.jump_mm.value, chance - 0.5)
-        moved_m = (jitter_mm + jump_mm) * MM if effects.frame_jumps else 0.0
+        moved_m = (jittered_mm + jump_mm) * MM if effects.frame_jumps else 0.0
         yield moved_m + drifted_m

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 from harness.experiment.load import load_experiment
-from harness.experiment.schema import DRAWN, STATED, UNKNOWNS
+from harness.experiment.schema import DRAWN, STATED
 from harness.experiment.unfold import source_of, stated_value
 from harness.experiment.unknowns import PARTS, UnknownConfig, is_same_fact
 from harness.runs.plan import plan_of
 from harness.vocabulary.declaration.yaml_source import DeclarationError
+from harness.vocabulary.path_names import UNKNOWNS
 from tests.support.tiny_sweep import STUDY, TINY
 
 BACKING = UnknownConfig(
@@ -80,6 +81,14 @@ def test_facts_that_overlap():
             "give either `values` or `range`",
         ),
         ("{key: source.target.tilt_deg, range: [2.0, 2.0], reason: r}", "is empty"),
+        (
+            "{key: source.target.tilt_deg, values: [1.0, 2.0, 1.0], reason: r}",
+            "`values` repeat 1.0: equally probable",
+        ),
+        (
+            "{key: source.target.backing, values: [null, {distance_mm: 9.0}, null], reason: r}",
+            "`values` repeat null",
+        ),
         ("{key: capture.frames, values: [1, 2], reason: r}", "is no fact of source.target"),
         ("{key: source.camera.name, values: [a, b], reason: r}", "is chosen"),
         ("{key: source.target.damage.kind, values: [a, b], reason: r}", "is chosen"),
@@ -87,7 +96,7 @@ def test_facts_that_overlap():
         ("{key: source.target.tilt_deg, range: [1.0, 99.0], reason: r}", "99"),
         ("{key: source.camera.numbers.scatter.blur, range: [0.1, 0.2], reason: r}", "scatter.blur"),
         (
-            "{key: source.target.backing, values: [null, null], reason: r}, "
+            "{key: source.target.backing, values: [null, {distance_mm: 9.0}], reason: r}, "
             "{key: source.target.backing.distance_mm, range: [1.0, 2.0], reason: r}",
             "set the same fact",
         ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pandas as pd
 import pytest
 
@@ -44,6 +46,19 @@ def test_the_table_and_the_page_state_the_unknowns(serial):
     assert limits["unknowns"].tolist() == ["stated", "stated", "drawn", "drawn"]
     page = (results(serial) / "report.html").read_text()
     assert "What nobody has measured" in page and "tornado-1" in page
+
+
+def test_shards_of_a_study_with_unknowns_join_to_the_same_bytes(serial, tmp_path):
+    """Two parts in a common folder, which has the renders already."""
+    (tmp_path / "tiny.yaml").write_text(TEXT)
+    out = tmp_path / "out"
+    shutil.copytree(results(serial).parents[1] / ".cache", out / ".cache")
+    for number in (1, 2):
+        done = sweep(tmp_path / "tiny.yaml", out, "--shard", f"{number}/2", "--serial")
+        assert done.returncode == 0, done.stderr
+    joined = sweep(tmp_path / "tiny.yaml", out, "--serial")
+    assert joined.returncode == 0, joined.stderr
+    assert content(results(out)) == content(results(serial))
 
 
 def test_processes_and_a_second_run_give_the_same_numbers(serial, tmp_path):

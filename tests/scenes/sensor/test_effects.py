@@ -225,9 +225,13 @@ def test_drift_decays_and_tilts(minutes):
 def test_frames_jitter_and_jump_as_a_whole():
     """Jitter by chi-square at alpha 0.001; of 300 frames, jumps as many as a binomial's 99.9 %
     interval allows."""
-    unit = unit_of(config(frame_jumps=True, numbers={"unit.jump_rate": 0.05}))
+    # a jitter of 0.25 mm at this view's light: the converter of `FINE` has units of its own
+    still = unit_of(config())
+    sums = still.model.amplitude_sums(still.exposure)
+    numbers = {"unit.jump_rate": 0.05, "unit.jitter_at_units": float(np.median(sums))}
+    unit = unit_of(config(frame_jumps=True, numbers=numbers))
     z = z_of(unit, 300)
-    shift_mm = (z - z_of(unit_of(config()))[0]) * stretch_of(unit) * 1e3
+    shift_mm = (z - z_of(still)[0]) * stretch_of(unit) * 1e3
     assert np.ptp(shift_mm, axis=(1, 2)).max() < 0.05
     mean_mm = shift_mm.mean(axis=(1, 2))
     jumped = np.abs(mean_mm) > 10
@@ -397,12 +401,43 @@ def test_the_drift_goes_on_during_a_capture():
     """exp(-t / tau): 30 frames a second, so 900 frames are half a minute."""
     settings = config(numbers={"unit.drift_mm": 100.0, "unit.drift_ramp": 0.0}, warm_up_drift=True)
     facts = camera_of(settings).unit
-    errors = frame_errors_m(facts, settings.effects, 5.0, np.random.default_rng(1))
+    errors = frame_errors_m(
+        facts, settings.effects, minutes=5.0, jitter_mm=0.0, rng=np.random.default_rng(1)
+    )
     errors_m = list(islice(errors, 901))
     minutes = facts.drift_min.value
     wanted_m = 0.1 * (np.exp(-5.5 / minutes) - np.exp(-5.0 / minutes))
     assert errors_m[0] == 0.0
     assert errors_m[-1] == pytest.approx(wanted_m, rel=1e-6)
+
+
+def test_jitter_is_inversely_proportional_to_the_light():
+    """By hand: an albedo of 0.6 at 0.9 m gives 1168 electrons * 0.6 / 0.9^2 times the contrasts
+    0.87, 0.88 and 0.96, at 1.4 electrons a unit."""
+    settings = config(fine=False, frame_jumps=True)
+    sum_units = 1168 * 0.6 / 0.9**2 * (0.87 + 0.88 + 0.96) / 1.4
+    camera = camera_of(settings)
+    on_axis = Region(328, 338, 317, 327)  # away from it, the lens gathers less
+    on_axis_unit = SimulatedUnit(
+        camera, settings, plane_view(camera, on_axis, 0.9, 0.6, slope_x=0.0, slope_y=0.0)
+    )
+    assert on_axis_unit.jitter_mm == pytest.approx(0.25 * 320 / sum_units, rel=0.02)
+    unit = unit_of(settings)
+    assert unit_of(settings, albedo=0.3).jitter_mm == pytest.approx(2 * unit.jitter_mm, rel=1e-5)
+    # frames are displaced by it
+    errors_m = unit.capture(3000, 1, "jitter").errors_m
+    steady_m = errors_m[np.abs(errors_m) < 5e-3]
+    assert steady_m.std() * 1e3 == pytest.approx(unit.jitter_mm, rel=0.05)
+
+
+def test_jitter_of_a_dark_view_stays_finite():
+    """Without light, a view counts as one that barely has ranges: a sum of 12 units."""
+    unit = unit_of(config(fine=False, frame_jumps=True), albedo=1e-9)
+    assert unit.jitter_mm == pytest.approx(0.25 * 320 / 12)
+
+
+def test_jitter_of_other_cameras_is_the_same_in_any_light():
+    assert unit_of(config(V2), albedo=0.1).jitter_mm == 0.25
 
 
 @pytest.mark.parametrize("length_px", [0.4, 2.0, 12.0])

@@ -38,7 +38,9 @@ def unit_facts(**values: float) -> UnitFacts:
 
 
 def errors_mm(facts: UnitFacts, count: int, effects: EffectsConfig = ONLY_JUMPS) -> np.ndarray:
-    errors_m = frame_errors_m(facts, effects, 0.0, np.random.default_rng(2))
+    errors_m = frame_errors_m(
+        facts, effects, minutes=0.0, jitter_mm=facts.jitter_mm.value, rng=np.random.default_rng(2)
+    )
     return 1e3 * np.array(list(islice(errors_m, count)))
 
 

@@ -181,6 +181,26 @@ def test_the_first_line_says_that_the_atlas_is_older_than_a_part_of_the_code(
     assert "Older than the code" in (tmp_path / "out" / "atlas.html").read_text()
 
 
+@pytest.mark.parametrize(
+    ("part", "named"),
+    [
+        ("detectors/methods", "detectors"),
+        ("camera azure_kinect_nfov", "cameras"),
+    ],
+)
+def test_where_the_versions_are_todays_the_changed_code_is_named(
+    part: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    about = about_today()
+    about["digests"][part] = "0123456789ab"
+    table = limits().assign(detector_version=detector_type("matched").version)
+    asked = written_atlas(tmp_path / "atlas.parquet", table, json.dumps(about).encode())
+    assert first_line(asked, capsys) == (
+        f"Older than the code: this atlas was computed by tofpod {__version__} with earlier code of"
+        f" {named}; today's limits may differ."
+    )
+
+
 def test_an_atlas_that_states_no_code_is_called_older(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
