@@ -1,4 +1,5 @@
-"""Separates damage from the joint that it touches, with which it was found as one.
+"""Separates damage from the joint that it touches, with which it was found as one, and finds the
+fragments of joints.
 
 The joints of a feature are alike, so what lies outside the largest outline of the others is damage.
 It is measured there: within the outline, the depths of both add up. Not modelled: damage within a
@@ -6,13 +7,14 @@ joint's own outline, which remains a joint that differs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from detectors.findings.joints import Joints, plane_along
+from detectors.findings.joints import DEEPEST, Joints, plane_along
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
 from harness.vocabulary.geometry import Cloud
@@ -42,13 +44,7 @@ def damage_beside(
 ) -> tuple[TouchingDamage, ...]:
     """Return the damage that the differing joints of a feature touch."""
     points_m = cloud.points_m.reshape(-1, 3)
-    strongest = feature.members[0]
-    plane = plane_along(measurements[strongest].along, detections[strongest].centre_m)
-    half_m = np.zeros(2)
-    for number in feature.members:
-        places_m = points_m[detections[number].pixels] @ plane
-        middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
-        half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))
+    plane, half_m = _outline(cloud, detections, measurements, feature)
     touching = []
     for number in feature.differing:
         joint = detections[number]
@@ -67,6 +63,62 @@ def damage_beside(
         without_joint = _without_joint(evidence, joint, damage)
         touching.append(TouchingDamage(number, damage, without_joint))
     return tuple(touching)
+
+
+def fragments_of(
+    cloud: Cloud,
+    evidence: Evidence,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+    feature: Joints,
+) -> tuple[int, ...]:
+    """Return the numbers of findings that fit into the largest outline of a feature's joints
+    together with one of them, on the same side of the surface, and depart from it less than that
+    joint: its ends, where the rim or another joint parts them from it."""
+    points_m = cloud.points_m.reshape(-1, 3)
+    residual_m = evidence.residual_m.reshape(-1)
+    plane, half_m = _outline(cloud, detections, measurements, feature)
+    places_m = [points_m[detection.pixels] @ plane for detection in detections]
+    low_m = np.array([place_m.min(axis=0) for place_m in places_m])
+    high_m = np.array([place_m.max(axis=0) for place_m in places_m])
+    deepest_m = np.array([_deepest_m(residual_m[detection.pixels]) for detection in detections])
+    joints = np.array(feature.members + feature.differing)
+    fragments = []
+    for number, detection in enumerate(detections):
+        if number in joints or detection.kind != "depth":
+            continue
+        first_m = np.minimum(low_m[joints], low_m[number])
+        last_m = np.maximum(high_m[joints], high_m[number])
+        fits = (last_m - first_m <= 2.0 * half_m).all(axis=1)
+        share = deepest_m[number] / deepest_m[joints]
+        if (fits & (share > 0.0) & (share < 1.0)).any():
+            fragments.append(number)
+    return tuple(fragments)
+
+
+def _deepest_m(residuals_m: np.ndarray) -> float:
+    """Return the residual at the quantile `DEEPEST` of the sizes, with the sign of their sum."""
+    sizes_m = np.abs(residuals_m)
+    return math.copysign(float(np.quantile(sizes_m, DEEPEST)), float(residuals_m.sum()))
+
+
+def _outline(
+    cloud: Cloud,
+    detections: Sequence[Detection],
+    measurements: Sequence[Measurement],
+    feature: Joints,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions (3, 2) along and across the joints of a feature, and half the extent
+    (2,) of the largest outline of those that are alike, metres."""
+    points_m = cloud.points_m.reshape(-1, 3)
+    strongest = feature.members[0]
+    plane = plane_along(measurements[strongest].along, detections[strongest].centre_m)
+    half_m = np.zeros(2)
+    for number in feature.members:
+        places_m = points_m[detections[number].pixels] @ plane
+        middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
+        half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))
+    return plane, half_m
 
 
 def without_damage(feature: Joints, touching: Sequence[TouchingDamage]) -> Joints:

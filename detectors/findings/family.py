@@ -167,7 +167,11 @@ def sized(
 ) -> Size | None:
     """Fit the shapes and average them; None if no fit has converged. ``blur_choices``: of `BLURS`,
     those to try."""
-    blurs = _distinct_blurs(patch, blur_choices)
+    blur_u, blur_v = patch.blur_px
+    blurs = []
+    for ratio, soft, loss in blur_choices:
+        blur_px = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
+        blurs.append((replace(patch, blur_px=blur_px, soft=soft), loss))
     is_blur_known = len(blur_choices) == 1
     candidates = []
     for shape in shapes:
@@ -196,26 +200,6 @@ def _with_dim_floors(disc: ShapeFit) -> list[ShapeFit]:
             if fit.converged and _is_determined(fit):
                 candidates.append(ShapeFit(fit, patch, disc.loss))
     return candidates
-
-
-def _distinct_blurs(
-    patch: HolePatch, blur_choices: Sequence[tuple[float, bool, float]]
-) -> list[tuple[HolePatch, float]]:
-    """Return the patch with each of the blurs, and the penalty of each. Blurs that come out as a
-    single pixel are one, whose evidence is the sum of theirs."""
-    blur_u, blur_v = patch.blur_px
-    evidence: dict[tuple[float, float, bool], float] = {}
-    for ratio, soft, loss in blur_choices:
-        sides = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
-        # a soft blur is two rectangles, of 1 / sqrt(2) of its sides, of which none is below a pixel
-        is_pixel = soft and max(sides) <= math.sqrt(2.0)
-        blur = (1.0, 1.0, False) if is_pixel else (*sides, soft)
-        evidence[blur] = evidence.get(blur, 0.0) + math.exp(-0.5 * loss)
-    blurs = []
-    for (side_u, side_v, soft), share in evidence.items():
-        blurred = replace(patch, blur_px=(side_u, side_v), soft=soft)
-        blurs.append((blurred, -2.0 * math.log(share)))
-    return blurs
 
 
 def _is_determined(fit: HoleFit) -> bool:

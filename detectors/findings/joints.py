@@ -102,8 +102,8 @@ def joints_of(
         if (similar & slots.is_long).sum() < FEWEST:
             continue
         on_lattice = parallel & _on_lattice(cloud, evidence, slots, similar)
-        members = on_lattice & similar
-        members &= ~_departing(slots, members)
+        # uncertain sizes that are far off are no departure
+        members = on_lattice & ~_departing(slots, on_lattice & similar)
         if (members & slots.is_long).sum() < FEWEST:
             continue
         free &= ~on_lattice
@@ -116,10 +116,13 @@ def joined(
     detections: Sequence[Detection],
     measurements: Sequence[Measurement],
     features: Sequence[Joints],
+    fragments: Sequence[int] = (),
 ) -> tuple[tuple[Detection, ...], tuple[Measurement, ...]]:
     """Return the findings, strongest first, with each feature as one finding. It has the place and
-    the sizes of its strongest member and the pixels of all of them."""
+    the sizes of its strongest member and the pixels of all of them. ``fragments``: numbers of
+    findings that are parts of a joint, which are left out."""
     in_feature = {number for feature in features for number in feature.members}
+    in_feature.update(fragments)
     pairs = []
     for number, pair in enumerate(zip(detections, measurements, strict=True)):
         if number not in in_feature:
@@ -182,14 +185,17 @@ def _slots(
     diameters_m = np.array([measured.model_diameter_m for measured in chosen])
     diameter_errors_m = np.array([measured.model_diameter_se_m for measured in chosen])
     depth_errors_m = np.array([measured.normal_depth_se_m for measured in chosen])
-    width_errors_m = widths_m * diameter_errors_m / diameters_m
+    depths_m = np.array([measured.normal_depth_m for measured in chosen])
+    # blur leaves the volume, so that a narrower slot may be a less deep one
+    shares = np.hypot(diameter_errors_m / diameters_m, depth_errors_m / depths_m)
+    width_errors_m = widths_m * shares
     return _Slots(
         numbers=np.array(numbers, np.int64),
         centres_m=np.array([_centre(measured) for measured in chosen]).reshape(-1, 3),
         along=np.array([measured.along for measured in chosen]).reshape(-1, 3),
         lengths_m=np.array([measured.length_m for measured in chosen]),
         widths_m=widths_m,
-        depths_m=np.array([measured.normal_depth_m for measured in chosen]),
+        depths_m=depths_m,
         areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
         errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
         deepest_m=np.array(deepest_m),

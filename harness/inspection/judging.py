@@ -7,7 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from detectors.findings.beside_joints import TouchingDamage, damage_beside, without_damage
+from detectors.findings.beside_joints import (
+    TouchingDamage,
+    damage_beside,
+    fragments_of,
+    without_damage,
+)
 from detectors.findings.joints import joined, joints_facts, joints_of
 from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
@@ -50,7 +55,9 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     joints = joints_of(cloud, evidence, detections, measurements)
     if joints:
         touching: list[TouchingDamage] = []
+        fragments: list[int] = []
         for feature in joints:
+            fragments += fragments_of(cloud, evidence, detections, measurements, feature)
             touching += damage_beside(cloud, evidence, detections, measurements, feature)
         joints = tuple(without_damage(feature, touching) for feature in joints)
         detections += tuple(damage.detection for damage in touching)
@@ -59,7 +66,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         )
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
-        detections, measurements = joined(detections, measurements, joints)
+        detections, measurements = joined(detections, measurements, joints, fragments)
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)

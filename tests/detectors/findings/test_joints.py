@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.findings.beside_joints import damage_beside, without_damage
+from detectors.findings.beside_joints import damage_beside, fragments_of, without_damage
 from detectors.findings.joints import chance_of_following, joined, joints_facts, joints_of
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud
@@ -92,6 +92,23 @@ def test_a_joint_that_is_deeper_in_a_part_of_it_differs_and_an_uncertain_width_d
     measurements[9] = replace(measurements[9], model_diameter_se_m=error_m)
     (feature,) = joints_of(CLOUD, evidence, detections, measurements)
     assert feature.differing == (7,)
+
+
+@pytest.mark.parametrize(("depth_error_m", "differs"), [(3e-4, True), (2.4e-3, False)])
+def test_a_joint_whose_volume_the_blur_parts_otherwise_is_alike(
+    depth_error_m: float, differs: bool
+) -> None:
+    """A joint that is fitted 0.6 times as wide and 1.7 times as deep."""
+    detections, measurements = wall()
+    measurements[7] = replace(
+        measurements[7],
+        width_m=0.6 * measurements[7].width_m,
+        model_depth_m=1.7 * measurements[7].model_depth_m,
+        model_depth_se_m=depth_error_m,
+    )
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == ((7,) if differs else ())
+    assert (7 in feature.members) is not differs
 
 
 def test_a_joint_that_no_slot_explains_differs_if_it_is_larger_too() -> None:
@@ -205,6 +222,35 @@ def test_damage_that_touches_a_joint_is_a_finding_of_its_own() -> None:
     whole = without_damage(feature, [part])
     assert sorted(whole.members) == list(range(len(BRICKS)))
     assert whole.differing == ()
+
+
+@pytest.mark.parametrize(
+    ("row_off", "deviation_m", "is_fragment"),
+    [(8, 2e-3, True), (8, 6e-3, False), (8, -2e-3, False), (12, 2e-3, False)],
+)
+def test_the_end_of_a_joint_that_was_found_alone_is_a_fragment_of_it(
+    row_off: int, deviation_m: float, is_fragment: bool
+) -> None:
+    """Two rows of the joint's end, 8 rows from its middle; damage is deeper, a bump or outside."""
+    detections, measurements = wall()
+    row, column = BRICKS[7]
+    kept = detections[7].pixels[detections[7].pixels // SHAPE[1] < row + 7]
+    detections[7] = replace(detections[7], pixels=kept)
+    rows, columns = np.mgrid[row + row_off : row + row_off + 2, column - 1 : column + 2]
+    end = np.sort((rows * SHAPE[1] + columns).ravel())
+    residual_m = np.zeros(SHAPE)
+    for detection in detections:
+        residual_m.reshape(-1)[detection.pixels] = 5e-3
+    residual_m.reshape(-1)[end] = deviation_m
+    evidence = replace(EVIDENCE, residual_m=residual_m)
+    centre_m = CLOUD.points_m.reshape(-1, 3)[end].mean(axis=0)
+    detections.append(Detection(9.0, end, centre_m))
+    measurements.append(replace(measurements[0], length_m=6e-3, width_m=6e-3, score=9.0))
+    (feature,) = joints_of(CLOUD, evidence, detections, measurements)
+    fragments = fragments_of(CLOUD, evidence, detections, measurements, feature)
+    assert fragments == ((len(BRICKS),) if is_fragment else ())
+    found, _ = joined(detections, measurements, [feature], fragments)
+    assert len(found) == (1 if is_fragment else 2)
 
 
 def test_a_deeper_joint_has_no_damage_beside_it() -> None:

@@ -18,7 +18,6 @@ from detectors.findings.family import (
     RADIUS_ERROR_PX,
     ShapeFit,
     Start,
-    _distinct_blurs,
     averaged,
     mixture,
     sized,
@@ -263,20 +262,3 @@ def test_a_slot_s_angle_and_length_are_fitted() -> None:
     assert fit.converged
     np.testing.assert_allclose(fit.numbers[[0, 1, 6]], truth[[0, 1, 6]], atol=0.02)
     np.testing.assert_allclose(fit.numbers[[2, 3, 5]], truth[[2, 3, 5]], rtol=0.02)
-
-
-def test_blurs_of_a_single_pixel_are_one_with_the_evidence_of_all() -> None:
-    patch = replace(patch_of(FRONTAL_PX_M), blur_px=(1.0, 1.0))
-    sharp, wider = _distinct_blurs(patch, BLURS)
-    losses = np.array([loss for ratio, _, loss in BLURS if ratio != 1.5])
-    assert (sharp[0].blur_px, sharp[0].soft) == ((1.0, 1.0), False)
-    assert sharp[1] == pytest.approx(-2.0 * math.log(np.exp(-0.5 * losses).sum()))
-    assert (wider[0].blur_px, wider[0].soft, wider[1]) == ((1.5, 1.5), False, 4.0)
-    # two pixels and more: a soft blur differs from a sharp one
-    wide = _distinct_blurs(replace(patch, blur_px=(4.0, 3.0)), BLURS)
-    assert len(wide) == len(BLURS)
-    assert wide[2][0].blur_px == (4.0, 3.0) and wide[2][0].soft
-    # what counts as one is drawn alike
-    hole = numbers_of("disc")[None]
-    soft = replace(patch, blur_px=(1.4, 1.4), soft=True)
-    np.testing.assert_allclose(pictures(soft, hole), pictures(sharp[0], hole), atol=1e-12)
