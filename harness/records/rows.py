@@ -51,8 +51,9 @@ class RunRow:
     threshold: Annotated[float, "threshold in use; empty in calibration runs"]
     quiet_threshold: Annotated[float, "hole-free boards: score above which nothing is found"]
     peaks: Annotated[
-        list[float] | None, "in a study's calibration: scores of the strongest findings"
-    ] = None
+        list[float],
+        "in a study's calibration: scores of the strongest findings, highest first; else empty",
+    ] = field(default_factory=list)
     scale_mm: Annotated[float, "residual per unit of score"]
     surface_noise_mm: Annotated[
         float, "robust deviation from the fitted surface on the undamaged face"

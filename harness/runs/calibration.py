@@ -5,13 +5,13 @@ digits. So the journal stores the thresholds in use; after a merge, trials judge
 of them count as judged at them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import isclose
 from typing import Any
 
 import numpy as np
 
-from harness.evaluation.intervals import threshold_for_rate
+from harness.evaluation.peaks import threshold_from_peaks
 from harness.experiment.schema import Point
 from harness.runs.jobs import Ended, Failure
 from harness.runs.journal import THRESHOLDS, Journal, record_text
@@ -28,8 +28,22 @@ judged."""
 AGREES = 1e-3
 """Relative difference of equal thresholds: below a tenth of the standard error of one from twenty
 boards."""
-Quiet = dict[str, dict[str, tuple[float, float]]]
-"""(quiet threshold, judged area in m2) by point digest, then by trial key."""
+
+
+@dataclass(frozen=True)
+class QuietRun:
+    """A hole-free run."""
+
+    threshold: float
+    """Lowest threshold without a finding."""
+    area_m2: float
+    """Judged area."""
+    peaks: tuple[float, ...] = ()
+    """Scores of the strongest findings, highest first; empty outside studies."""
+
+
+Quiet = dict[str, dict[str, QuietRun]]
+"""Hole-free runs by point digest, then by trial key."""
 
 
 class Calibration:
@@ -49,7 +63,8 @@ class Calibration:
             quiet_threshold = run["quiet_threshold"]
             if quiet_threshold is not None:
                 area_m2 = run.get("inspected_m2", np.nan)
-                self._quiet.setdefault(run["point"], {})[key] = (quiet_threshold, area_m2)
+                quiet = QuietRun(quiet_threshold, area_m2, tuple(run.get("peaks") or ()))
+                self._quiet.setdefault(run["point"], {})[key] = quiet
 
     def thresholds(self) -> tuple[dict[str, float], list[Failure]]:
         """Return thresholds by point digest; and a failure for each point that has none."""
@@ -141,26 +156,26 @@ def refiled(entry: Ended, judged: Trial, task: Trial) -> Ended:
     return replace(entry, value=record_text(record))
 
 
-def threshold_of(point: Point, quiet: Iterable[tuple[float, float]]) -> float | None:
+def threshold_of(point: Point, quiet: Iterable[QuietRun]) -> float | None:
     """Return a point's threshold: given, or from its hole-free runs; None without runs.
 
-    ``quiet``: (quiet threshold, judged area in m2) of each run. The threshold is the highest or,
-    in a study, the one for the wanted rate of false calls. Raises UserError."""
+    The threshold is the runs' highest quiet threshold or, in a study, the one for the wanted rate
+    of false calls. Raises UserError."""
     given_k = point.config.threshold.k
     calibrate = point.config.threshold.calibrate
     runs = list(quiet)
     if given_k is not None or not runs:
         return given_k
-    thresholds, areas_m2 = np.array(runs).T
     if calibrate is None or calibrate.false_calls_per_m2 is None:
-        return float(thresholds.max())
-    area_m2 = float(areas_m2.mean())
+        return max(run.threshold for run in runs)
+    area_m2 = float(np.mean([run.area_m2 for run in runs]))
     if not area_m2 > 0:
         detector = point.config.detector.name
         message = f"the detector {detector!r} gave no score to any pixel of the hole-free boards"
         raise UserError(message, fix="check its crop against the boards' poses")
     try:
-        return threshold_for_rate(thresholds, area_m2, calibrate.false_calls_per_m2).value
+        peaks = [run.peaks for run in runs]
+        return threshold_from_peaks(peaks, area_m2, calibrate.false_calls_per_m2).value
     except UserError as error:
         board = point.config.simulated.target.declare().board
         inspected_share = area_m2 / (board.width_mm * board.height_mm * MM**2)

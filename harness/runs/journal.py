@@ -22,7 +22,7 @@ from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.seeds import canonical_json
 
 # raised with every change to records or to what a trial computes: older trials then run again
-JOURNAL_VERSION = 7
+JOURNAL_VERSION = 8
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
 NOTHING = "null"  # replaces the record of a trial that is not done

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from harness.evaluation.peaks import threshold_from_peaks
 from harness.evaluation.study.record import (
     Calibrated,
     DrawnUnknown,
     Inspected,
     SetUpRecord,
     StudyRecord,
+    ThresholdError,
     Unflawed,
 )
-from harness.experiment.schema import Experiment, Point, detector_version
+from harness.experiment.schema import Experiment, ExperimentConfig, Point, detector_version
 from harness.experiment.unfold import stated_value
 from harness.experiment.unknowns import UnknownConfig
 from harness.records.trials import ResultTables
@@ -100,6 +102,7 @@ def _set_up(
         frames_digest=digest(frames_decided_by),
         units=units,
         calibrated=_calibrated(calibrating),
+        threshold_error=_threshold_error(calibrating, config),
         drawn=tuple(_drawn(unknown, point, group) for unknown in point.unknowns),
     )
 
@@ -143,6 +146,25 @@ def _calibrated(calibrating: pd.DataFrame) -> Calibrated | None:
         y_mm=loudest["loudest_y_mm"].to_numpy(float),
         u_px=loudest["loudest_u_px"].to_numpy(float),
         v_px=loudest["loudest_v_px"].to_numpy(float),
+    )
+
+
+def _threshold_error(calibrating: pd.DataFrame, config: ExperimentConfig) -> ThresholdError | None:
+    """Return the uncertainty of a threshold for a rate; None for a threshold that was given."""
+    calibrate = config.threshold.calibrate
+    loudest = calibrating[calibrating["quiet_threshold"].notna()]
+    if calibrate is None or calibrate.false_calls_per_m2 is None or loudest.empty:
+        return None
+    threshold = threshold_from_peaks(
+        [list(peaks) for peaks in loudest["peaks"]],
+        float(loudest["inspected_m2"].mean()),
+        calibrate.false_calls_per_m2,
+    )
+    return ThresholdError(
+        error=threshold.error,
+        low_per_m2=threshold.interval_per_m2.low,
+        high_per_m2=threshold.interval_per_m2.high,
+        method=threshold.method,
     )
 
 

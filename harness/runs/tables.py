@@ -118,6 +118,8 @@ def _column(name: str, values: pd.Series, grids: Grids) -> pd.Series:
     if isinstance(values.iloc[0], list):
         if name == "threshold":
             arrays = [grids.setdefault(tuple(grid), np.array(grid)) for grid in values]
+        elif name == "peaks":
+            arrays = [np.array(scores, float) for scores in values]
         else:
             arrays = [np.array(counts, np.int32) for counts in values]
         return pd.Series(arrays, dtype=object)

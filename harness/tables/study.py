@@ -1,7 +1,7 @@
 """Tables of a study besides its limits: thresholds, chance hits, operating points, axes, and
 limits of depth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -76,6 +76,13 @@ CHANCE = Table(
 )
 GIVEN = "number of calibration runs; 0 for a given threshold"
 UNSET = "none: given"
+
+
+def _of_error(name: str) -> Callable[[SetUpLimit], float]:
+    """Return the reader of a number of the thresholds' error; NaN without one."""
+    return lambda limit: float(getattr(limit.record.threshold_error, name, np.nan))
+
+
 THRESHOLDS = Table(
     "thresholds",
     "one row per set-up and number of frames: its threshold, "
@@ -96,7 +103,27 @@ THRESHOLDS = Table(
             GIVEN,
             lambda n: str(n or UNSET),
         ),
-        replace(CALLS[0], label="per m² (95 %)"),
+        Column(
+            "rate_low_per_m2",
+            "true rate from",
+            _of_error("low_per_m2"),
+            "lower end of the 95 % interval of the true rate at the threshold, from the boards "
+            "that set it",
+        ),
+        Column("rate_high_per_m2", "to per m²", _of_error("high_per_m2"), "its upper end"),
+        Column(
+            "threshold_error",
+            "",
+            _of_error("error"),
+            "standard error of the threshold at which the rate is as wanted",
+        ),
+        Column(
+            "threshold_method",
+            "",
+            lambda row: getattr(row.record.threshold_error, "method", "given"),
+            "how the threshold was set",
+        ),
+        replace(CALLS[0], label="counted per m² (95 %)"),
         replace(CALLS[1], label="false calls on other boards"),
         replace(CALLS[2], label="undamaged m²"),
     ),
@@ -206,9 +233,10 @@ def threshold_note(record: StudyRecord) -> str:
     plural = "" if wanted == 1 else "s"
     return (
         f"Thresholds are calibrated to {wanted:g} false call{plural} per m² on separate undamaged "
-        "boards: a threshold is the lowest of their runs' highest scores that keeps to that rate "
-        "by order statistics (Wilks 1941). It is itself an estimate: the rate on other boards "
-        "scatters about the wanted rate."
+        "boards, by a tail through the strongest findings of each, or by order statistics "
+        "(Wilks 1941) where these contradict it. A threshold is itself an estimate: the table "
+        "states the interval of the true rate, and the intervals of a50 and a90 and a90/95 "
+        "contain the threshold's error."
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection, Evidence
+from detectors.levels import highest_peaks
 from detectors.score_map import (
     Findings,
     ScoreMapConfig,
@@ -138,3 +139,26 @@ def test_many_thresholds_at_once_are_each_alone() -> None:
     overridden = OverriddenFind(ScoreMapConfig())
     empty = findings_at(overridden, CLOUD, scores, thresholds)
     assert all(len(findings.scores) == 0 for findings in empty)
+
+
+def peaks_of(scores: np.ndarray, count: int) -> tuple[float, ...]:
+    judged = detector()
+    quiet = judged.quiet_threshold(CLOUD, evidence(scores))
+    return highest_peaks(judged, CLOUD, evidence(scores), quiet_threshold=quiet, count=count)
+
+
+def test_the_highest_peaks_are_those_of_the_strongest_findings() -> None:
+    """Twenty separate pixels from 5.0 to 6.9: at 0.9 times the highest are seven of them, at 0.85
+    ten and more."""
+    scores = np.zeros(SHAPE)
+    heights = 5.0 + 0.1 * np.arange(20)
+    rows, columns = np.indices(scores[::6, ::6].shape)
+    for number, height in enumerate(heights):
+        scores[6 * rows.flat[number], 6 * columns.flat[number]] = height
+    assert peaks_of(scores, 5) == pytest.approx(heights[::-1][:5])
+    assert peaks_of(scores, 10) == pytest.approx(heights[::-1][:10])
+    assert peaks_of(scores, 30) == pytest.approx(heights[::-1])  # there are no more
+
+
+def test_without_a_finding_the_quiet_threshold_is_the_only_peak() -> None:
+    assert peaks_of(np.zeros(SHAPE), 10) == (0.0,)

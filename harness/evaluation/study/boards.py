@@ -37,6 +37,9 @@ class Targets:
     """Number of inspections (n,)."""
     unit: np.ndarray | None = None
     """Unit (n,) of the camera, if each unit's inspections of a damage are a separate row."""
+    excess: np.ndarray | None = None
+    """If each inspection is a row: its signal (n,) above the threshold, in standard errors of the
+    threshold; infinite for a damage that is found at any threshold."""
 
 
 def targets_of(
@@ -102,7 +105,8 @@ def refitted_sizes(
     pods: tuple[float, ...],
     draws: int = DRAWS,
 ) -> np.ndarray:
-    """Refit ``curve``'s link and axis to resampled boards (and units, if targets have one).
+    """Refit ``curve``'s link and axis to resampled boards (and units, and drawn thresholds, where
+    targets have them).
 
     Returns sizes (len(pods), draws) in mm, by Firth's likelihood if hits and misses are separated.
     Infinite if nothing is found or POD does not grow; smallest if all is found."""
@@ -110,25 +114,59 @@ def refitted_sizes(
     if targets.unit is not None:
         rows.append((targets.unit, "units"))
     sizes = []
+    stream = random_stream(0, "thresholds drawn again")
     for weights in weights_in_blocks(draws, *rows):
-        sizes.append(_refitted(targets, curve, pods, np.multiply.reduce(weights)))
+        product = np.multiply.reduce(weights)
+        hits = hits_at(targets, stream.standard_normal(len(product)))
+        sizes.append(_refitted(targets, curve, pods, weights=product, hits=hits))
     return np.concatenate(sizes, axis=1)
+
+
+def hits_at(targets: Targets, shift: np.ndarray) -> np.ndarray:
+    """Return the hits (d, n) at thresholds that are higher by ``shift`` (d,) standard errors; all
+    rows of d are the hits in use if ``excess`` is not known.
+
+    A finding beside a damage can be a signal that is no hit; it becomes none at a higher threshold
+    and a hit at a lower one only if its signal lies between both."""
+    hits = np.broadcast_to(targets.hits, (len(shift), len(targets.hits)))
+    if targets.excess is None:
+        return hits
+    above = targets.excess > shift[:, None]
+    gained = above & (targets.excess <= 0)
+    return np.where(above, np.maximum(hits, gained), 0.0)
+
+
+def size_per_error(targets: Targets, curve: PodCurve, pod: float) -> float:
+    """Return by how much the logarithm of the size with this POD grows if the threshold is higher
+    by one standard error, from thresholds 1.645 standard errors below and above; at least 0, and 0
+    where a curve cannot be fitted to either."""
+    if targets.excess is None:
+        return 0.0
+    shift = np.array([-1.645, 1.645])
+    weights = np.ones((2, len(targets.hits)))
+    hits = hits_at(targets, shift)
+    low, high = _refitted(targets, curve, (pod,), weights=weights, hits=hits)[0]
+    if not (0 < low < high < np.inf):
+        return 0.0
+    return float(np.log(high / low) / (shift[1] - shift[0]))
 
 
 def _refitted(
     targets: Targets,
     curve: PodCurve,
     pods: tuple[float, ...],
+    *,
     weights: np.ndarray,
+    hits: np.ndarray,
 ) -> np.ndarray:
-    """Refit the curve to targets with ``weights`` (draws, n)."""
+    """Refit the curve to targets with ``weights`` and ``hits``, both (draws, n)."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     centre = float(x.mean())
     spread = float(x.std()) or 1.0
     z = (x - centre) / spread
     design = np.column_stack([np.ones_like(z), z])
-    hits = weights * targets.hits
-    misses = weights * (targets.inspections - targets.hits)
+    misses = weights * (targets.inspections - hits)
+    hits = weights * hits
     largest_miss = np.where(misses > 0, z, -np.inf).max(axis=1)
     smallest_hit = np.where(hits > 0, z, np.inf).min(axis=1)
     coefficients = np.full((len(weights), 2), np.nan)

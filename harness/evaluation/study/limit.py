@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from harness.evaluation.intervals import (
     UNKNOWN,
@@ -29,6 +30,7 @@ from harness.evaluation.study.boards import (
     Targets,
     design_effect,
     refitted_sizes,
+    size_per_error,
     targets_of,
     weights_in_blocks,
 )
@@ -40,6 +42,7 @@ from harness.vocabulary.errors import UserError
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
 """29: with a POD below 90 %, this many targets are all found in less than 5 % of studies (0.9^29 =
 0.047)."""
+ONE_SIDED = float(stats.norm.ppf(CONFIDENCE))
 WIDER = 1.1  # boards matter if the limit over boards exceeds a90/95 by more than this factor
 
 
@@ -223,17 +226,21 @@ def _sizes_of_curve(
     inspected = record.inspected
     unit = inspected.repeat % record.units
     rows = targets
-    if record.units > 1:
+    excess = _excess(record)
+    if record.units > 1 or excess is not None:
         rows = Targets(
             board=inspected.board,
             size_mm=inspected.size_mm,
             hits=inspected.hit.astype(float),
             inspections=np.ones(len(inspected.hit)),
-            unit=unit,
+            unit=unit if record.units > 1 else None,
+            excess=excess,
         )
     redrawn = refitted_sizes(rows, statement.curve, (0.5, POD), draws)
     a50_draws_mm, a90_draws_mm = np.maximum(redrawn, 0.0)
     over_boards, effect = _over_boards(statement, targets)
+    margin = ONE_SIDED * size_per_error(rows, statement.curve, POD)
+    over_boards = _with_margin(over_boards, statement.a90, margin)
     units: OverUnits | None = None
     if record.units > 1:
         units = over_units(
@@ -246,7 +253,7 @@ def _sizes_of_curve(
         )
     return _Sizes(
         statement=statement,
-        a90_95=statement.bound,
+        a90_95=_with_margin(statement.bound, statement.a90, margin),
         a50_mm=statement.a50,
         a90_mm=statement.a90,
         a90_draws_mm=a90_draws_mm,
@@ -256,6 +263,30 @@ def _sizes_of_curve(
         design_effect=effect,
         over_units=units,
     )
+
+
+def _excess(record: SetUpRecord) -> np.ndarray | None:
+    """Return the signals (n,) above the threshold in its standard errors, infinite for damage that
+    is found by missing returns; None if the threshold has no error."""
+    error = record.threshold_error
+    if error is None or not error.error > 0:
+        return None
+    inspected = record.inspected
+    excess = (np.nan_to_num(inspected.signal, nan=-np.inf) - record.threshold) / error.error
+    # a hit's own finding can lie outside the radius within which the signal is taken
+    excess = np.where(inspected.hit & ~(excess > 0), np.inf, excess)
+    if inspected.by_no_return is None:
+        return excess
+    return np.where(inspected.by_no_return, np.inf, excess)
+
+
+def _with_margin(bound: Bound, a90: float, margin: float) -> Bound:
+    """Return a bound on a90 with the ``margin`` of its logarithm that the threshold leaves open:
+    both are independent and combined as the root of the sum of squares (see `units`)."""
+    if not margin or not bound.demonstrated or not 0 < a90 < bound.value:
+        return bound
+    of_hits = np.log(bound.value / a90)
+    return replace(bound, value=a90 * float(np.exp(np.hypot(of_hits, margin))))
 
 
 def _over_boards(statement: PodStatement, targets: Targets) -> tuple[Bound, float]:

@@ -191,6 +191,21 @@ class Calibrated:
     """Its row (k,) on the sensor, or None."""
 
 
+@dataclass(frozen=True)
+class ThresholdError:
+    """Uncertainty of a threshold for a rate of false calls, from the boards that set it."""
+
+    __pydantic_config__ = FORM
+    error: Annotated[Real, Field(ge=0)]
+    """Standard error of the threshold at which the rate is as wanted."""
+    low_per_m2: Annotated[Real, Field(ge=0)]
+    """Lower end of the 95 % interval of the true rate at the threshold in use."""
+    high_per_m2: Annotated[Real, Field(ge=0)]
+    """Its upper end."""
+    method: Name
+    """How the threshold was set."""
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnUnknown:
     """A fact that nobody has measured, and what each damaged board had of it."""
@@ -252,6 +267,8 @@ class SetUpRecord:
     modulo ``units``, and every other board has a unit of its own."""
     drawn: tuple[Annotated[DrawnUnknown, AfterValidator(_one_table)], ...] = ()
     """Unknowns that differ from board to board."""
+    threshold_error: ThresholdError | None = None
+    """Uncertainty of the threshold; None for one that was given, and in older records."""
 
     @property
     def label(self) -> str:

@@ -495,7 +495,17 @@ class StudyResult:
     def conditions(self) -> str:
         """Return what all set-ups have in common, in one line."""
         fewest = min((limit.targets for limit in self.limits), default=None)
-        return conditions_of(self.facts, fewest)
+        conditions = conditions_of(self.facts, fewest)
+        errors = [result.limit.record.threshold_error for result in self.set_ups]
+        known = [error for error in errors if error is not None]
+        if not known:
+            return conditions
+        low = min(error.low_per_m2 for error in known)
+        high = max(error.high_per_m2 for error in known)
+        wanted = f"{self.record.false_calls_per_m2:g} false call"
+        plural = "" if self.record.false_calls_per_m2 == 1 else "s"
+        stated = f"threshold for {wanted}{plural} per m²"
+        return conditions.replace(stated, f"{stated} ({low:.1f} to {high:.1f})")
 
 
 def evaluate_study(

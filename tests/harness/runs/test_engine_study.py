@@ -23,7 +23,7 @@ from harness.experiment.load import load_experiment
 from harness.experiment.schema import Point
 from harness.records.trials import ResultTables
 from harness.runs import run
-from harness.runs.calibration import threshold_of
+from harness.runs.calibration import QuietRun, threshold_of
 from harness.runs.plan import plan_of
 from harness.runs.study_record import (
     RECORDED_PROVENANCE,
@@ -153,14 +153,14 @@ def point_with(**threshold: object) -> Point:
 def test_a_study_s_threshold_is_set_by_the_wanted_rate():
     """At 1 per m2 a run of 0.1 m2 calls with probability 0.0952. A new run exceeds the third
     highest of 39 with probability 3 / 40, the fourth with 4 / 40, which is too often."""
-    quiet = [(float(k), 0.1) for k in range(39)]
+    quiet = [QuietRun(float(k), 0.1, (float(k),)) for k in range(39)]
     assert threshold_of(point_with(false_calls_per_m2=1.0), quiet) == 36.0
     assert threshold_of(point_with(repeats=39), quiet) == 38.0
     assert threshold_of(point_with(repeats=39), []) is None
     with pytest.raises(UserError, match="too few"):
         threshold_of(point_with(false_calls_per_m2=0.1), quiet)
     with pytest.raises(UserError, match=r"sees nothing of the board here but 0\.83 % of its face"):
-        threshold_of(point_with(false_calls_per_m2=1.0), [(1.0, 0.001)] * 39)
+        threshold_of(point_with(false_calls_per_m2=1.0), [QuietRun(1.0, 0.001, (1.0,))] * 39)
 
 
 def test_each_board_has_its_own_noise_and_its_own_errors_of_nominal_poses(tmp_path):
