@@ -33,9 +33,9 @@ DEEP_WINDOW_PX = 3
 hole."""
 DENT_RADII_PX = (5.0, 6.5, 8.0, 10.0, 12.0, 14.5, 17.5)
 """Radii of paraboloids. They are denser because before a fixed pattern the rims decide."""
-SLOT_PX = (12.0, 2.0)
-"""Length and width of slots: shorter than most, so that a few angles suffice."""
-SLOTS_DEG = tuple(15.0 * k for k in range(12))  # their angles to the rows
+SLOT_LENGTHS_PX = (8.0, 14.0, 24.0)
+SLOT_WIDTH_PX = 2.0
+SLOTS_DEG = tuple(11.25 * k for k in range(16))  # angles of slots to the rows
 COARSE_PX = 9.0
 """Radius from which only every second pixel is scored: between these pixels, scores change by some
 hundredths."""
@@ -47,6 +47,15 @@ SIDES_PX = (0, 1, 2, 3, 5, 8, 12, 18)
 # --- the bank ---
 
 
+class SlotSides(NamedTuple):
+    """A rectangle."""
+
+    length_px: float
+    width_px: float
+    angle_deg: float
+    """Angle of its length to the rows."""
+
+
 class Template(NamedTuple):
     """A damage of height 1 as a camera sees it."""
 
@@ -56,7 +65,8 @@ class Template(NamedTuple):
     """Radius of a disc of equal size."""
     halves: tuple[int, int] = (0, 0)
     """Offset (down, right) of its centre from the middle, in half pixels."""
-    slot: bool = False
+    slot: SlotSides | None = None
+    """Sides and angle of a slot."""
     coarse: bool = False
     """True if it is scored on every second pixel."""
 
@@ -68,7 +78,8 @@ def bank(window_px: int) -> tuple[Template, ...]:
     sharp = [_disc(radius_px, offset) for radius_px in SMALL_RADII_PX for offset in HALVES_PX]
     sharp += map(_disc, RADII_PX)
     sharp += map(_dent, DENT_RADII_PX)
-    sharp += map(_slot, SLOTS_DEG)
+    for length_px in SLOT_LENGTHS_PX:
+        sharp += [_slot(SlotSides(length_px, SLOT_WIDTH_PX, angle)) for angle in SLOTS_DEG]
     window = (window_px, window_px)
     templates = []
     for template in sharp:
@@ -100,15 +111,21 @@ def _dent(radius_px: float) -> Template:
     return Template(_drawn(height, radius_px), radius_px, coarse=radius_px >= COARSE_PX)
 
 
-def _slot(angle_deg: float) -> Template:
-    length, width = SLOT_PX
-    turn = np.exp(-1j * math.radians(angle_deg))
+def _slot(sides: SlotSides) -> Template:
+    turn = np.exp(-1j * math.radians(sides.angle_deg))
 
     def inside(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         along = (x + 1j * y) * turn
-        return (np.abs(along.real) < length / 2) & (np.abs(along.imag) < width / 2)
+        is_along = np.abs(along.real) < sides.length_px / 2
+        return is_along & (np.abs(along.imag) < sides.width_px / 2)
 
-    return Template(_drawn(inside, length / 2), length / 4, slot=True, coarse=True)
+    area_px = sides.length_px * sides.width_px
+    return Template(
+        image=_drawn(inside, sides.length_px / 2),
+        radius_px=math.sqrt(area_px / math.pi),
+        slot=sides,
+        coarse=True,
+    )
 
 
 def _drawn(height: Callable[[np.ndarray, np.ndarray], np.ndarray], reach_px: float) -> np.ndarray:
@@ -248,9 +265,10 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         maxima += (np.sqrt(row_moment * column_moment) / energy * side**2).tolist()
     template_worths = []
     highest = max(maxima)
+    slots = len(SLOT_LENGTHS_PX) * len(SLOTS_DEG)
     for number, template in enumerate(bank(window_px)):
         # slots of all angles together are as rare as one round template
-        crowd = maxima[number] * (len(SLOTS_DEG) if template.slot else 1)
+        crowd = maxima[number] * (slots if template.slot else 1)
         raised = max(math.log(highest / crowd), 0.0)
         template_worths.append(Worth(energies[number], sides[number], raised))
     return tuple(template_worths)

@@ -2,30 +2,32 @@
 
 The residuals' autocovariance, temporal noise and fixed pattern together, is measured on the
 capture itself, without strong residuals, or learned from hole-free clouds. Each template t (discs
-of several radii through a camera's window or lens, slots at several angles, dents) is then
-compared with the residuals r of the known pixels under that covariance C:
+of several radii through a camera's window or lens, slots, dents) is then compared with the
+residuals r of the known pixels under that covariance C:
 
     score = t' C^-1 r / sqrt(t' C^-1 t)
 
 C^-1 r is solved for by conjugate gradients, so missing pixels and borders add nothing and need no
 filling. The scores of each template are then divided by their own deviation, separately for each
 distance from the outline (`detectors.methods.scatter`). Wide templates have few independent
-positions, so their scores are raised (`detectors.findings.templates.Worth`).
+positions, so their scores are raised (`detectors.findings.templates.Worth`). Slots are scored on
+every second pixel, and around each of their peaks the best of many others is looked for
+(`detectors.methods.slots`).
 
 Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that
 no filter sees the shoulder of a neighbouring hole. What pixels along the target's outline share
 beyond those farther in is subtracted. Upsampled depth is judged on squares of pixels in which its
 noise reaches no farther than a camera's window.
 
-Not modelled: slots that no template fits; slots within `RIM_PX` of outlines and of removed
-findings; distortion of templates on steep surfaces; missing returns, except the few that are not
-findings by themselves (`detectors.findings.missing`). The denominator takes the share of a
+Not modelled: slots within `RIM_PX` of outlines and of removed findings; distortion of templates on
+steep surfaces; missing returns, except the few that are not findings by themselves
+(`detectors.findings.missing`). The denominator takes the share of a
 template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely; a
-template does not judge pixels where less than `LEAST_SEEN` of it is visible. Slots are scored on
-every second pixel."""
+template does not judge pixels where less than `LEAST_SEEN` of it is visible."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, NamedTuple
@@ -37,7 +39,7 @@ import numpy as np
 from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
 from detectors.interface import Evidence
-from detectors.methods import local
+from detectors.methods import local, slots
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of
 from detectors.pixels.clusters import PLAIN
@@ -322,6 +324,8 @@ class _Noise(NamedTuple):
     """Side of the camera's window that the noise indicates."""
     worths: tuple[templates.Worth, ...]
     """Worth of each template."""
+    slot_energies: np.ndarray
+    """Whitened energies of slots (`slots.energies`)."""
 
 
 class _Scores(NamedTuple):
@@ -333,8 +337,8 @@ class _Scores(NamedTuple):
     """(r, c): its number in the bank."""
     solved: np.ndarray
     """(r, c): C^-1 r."""
-    spread: float
-    """Deviation of the narrowest template's scores."""
+    deviations: np.ndarray
+    """(t,): deviation of each template's scores."""
 
 
 def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -349,6 +353,7 @@ def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.nd
         whitening.filters(covariance, known.shape),
         window_px,
         templates.worths(power, window_px),
+        slots.energies(power, window_px),
     )
     tamed = _tamed(residuals.values)
     radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
@@ -372,8 +377,11 @@ def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.nd
     else:
         second = _scored(tamed * known, known, noise, discs > 0, first.solved)
     signed = second.signed
-    # only now are deviations known; that of the narrowest template is known best
-    strong = strong / second.spread
+    # only now are deviations known; among those of round templates, that of the narrowest is known
+    # best
+    is_slot = np.array([template.slot is not None for template in templates.bank(window_px)])
+    deviations = np.where(is_slot, second.deviations, second.deviations[0])
+    strong = strong / deviations[first.template[tuple(peaks.T)]]
     _fill_discs(signed, radius_px[second.template])
     signed *= known
     signed[core] = heights[core] * strong[peak_of[core]]
@@ -491,11 +499,11 @@ class _View:
 
     def factors(self, template: templates.Template, worth: templates.Worth) -> np.ndarray:
         """Return 1 / sqrt(visible share) (r, c) of a template, 0 where it does not judge."""
-        key = template.slot, worth.sides
+        key = template.slot is not None, worth.sides
         if key not in self._factors:
             share = cv2.blur(self.seen, worth.sides, borderType=cv2.BORDER_CONSTANT)
             judged = self.seen
-            if template.slot:
+            if template.slot is not None:
                 # errors along outlines, from light and flying pixels, look like slots
                 judged = judged * (self.depth_px > RIM_PX)
             self._factors[key] = _visible(share, judged)
@@ -542,12 +550,15 @@ def _scored(
     best = _Best(fine.seen.shape)
     coarse_best = _Best(coarse.seen.shape)
     slot_best = _Best(coarse.seen.shape)
-    spread = 1.0
     tail = 1.0
+    deviations = np.ones(len(templates.bank(noise.window_px)))
+    slot_responses = {}
     for view, number, response in _responses(fine, coarse, noise, strong is None):
         template = templates.bank(noise.window_px)[number]
         worth = noise.worths[number]
         score = view.score
+        if template.slot is not None:
+            slot_responses[number] = response.copy()
         factors = view.factors(template, worth)
         cv2.multiply(response, factors, dst=score, scale=worth.energy**-0.5)
         deviation = 1.0
@@ -557,11 +568,10 @@ def _scored(
                 if not any(template.halves):
                     tail = tail_of(score, deviation)
                 deviation *= tail
-        if number == 0:
-            spread = deviation
+        deviations[number] = deviation
         kept = best
         if template.coarse:
-            kept = slot_best if template.slot else coarse_best
+            kept = coarse_best if template.slot is None else slot_best
         down, right = template.halves
         _keep_stronger(
             kept.signed,
@@ -573,10 +583,69 @@ def _scored(
             right,
             number,
         )
+    # errors along outlines, from light and flying pixels, look like slots
+    blurred = slots.blurred(solved, noise.window_px) * (fine.depth_px > RIM_PX)
+    refined = _refined_slots(slot_best, slot_responses, blurred, noise)
     # linear interpolation would lower the narrow ridges of slots' scores by a seventh
     _merge(best, coarse_best, cv2.INTER_LINEAR)
+    slot_best.signed = slots.lowered(slot_best.signed)
     _merge(best, slot_best, cv2.INTER_NEAREST)
-    return _Scores(best.signed * seen, best.template, solved, spread)
+    for slot, number in refined:
+        _draw(best, slot, number)
+    return _Scores(best.signed * seen, best.template, solved, deviations)
+
+
+def _refined_slots(
+    slot_best: _Best,
+    responses: Mapping[int, np.ndarray],
+    blurred: np.ndarray,
+    noise: _Noise,
+) -> list[tuple[slots.BestSlot, int]]:
+    """Return the best slots around the peaks of the bank's, with their final scores, and the
+    number of the bank's slot there.
+
+    Args:
+        slot_best: the bank's, on the halved picture.
+        responses: (r / 2, c / 2) of each of them.
+        blurred: (r, c), of `slots.blurred`.
+        noise: of the picture."""
+    refined = []
+    for row, column in slots.peaks_of(slot_best.signed).tolist():
+        number = int(slot_best.template[row, column])
+        sides = templates.bank(noise.window_px)[number].slot
+        assert sides is not None
+        score = float(slot_best.signed[row, column])
+        slot = slots.best_slot(
+            blurred,
+            noise.slot_energies,
+            (2 * row + 0.5, 2 * column + 0.5),
+            sides,
+            math.copysign(1.0, score),
+        )
+        # what is seen there, the deviation of scores and how it differs there are those of the
+        # bank's slot: of the other widths the deviations differ by up to 4 %
+        response = float(responses[number][row, column]) * noise.worths[number].energy ** -0.5
+        final = slots.lowered(np.array(score / response * slot.score))
+        refined.append((slot._replace(score=float(final)), number))
+    return refined
+
+
+def _draw(best: _Best, slot: slots.BestSlot, number: int) -> None:
+    """Raise the scores along a slot, so that it is one finding with its peak in the middle."""
+    half_px = slot.length_px / 2
+    along = np.arange(-half_px, half_px + 0.5, 0.5)
+    angle_rad = math.radians(slot.angle_deg)
+    rows = np.rint(slot.row + math.sin(angle_rad) * along).astype(int)
+    columns = np.rint(slot.column + math.cos(angle_rad) * along).astype(int)
+    height, width = best.signed.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    scores = np.full(len(along), local.SADDLE * 1.01 * slot.score, np.float32)
+    scores[len(along) // 2] = slot.score
+    place = rows[inside], columns[inside]
+    scores = scores[inside]
+    stronger = np.abs(scores) > np.abs(best.signed[place])
+    best.signed[place] = np.where(stronger, scores, best.signed[place])
+    best.template[place] = np.where(stronger, number, best.template[place])
 
 
 def _responses(

@@ -81,7 +81,7 @@ def evened(score: np.ndarray, template: Template, zones: Zones) -> float:
     wide templates, nor those next to them."""
     step = 2 if template.coarse else 1
     loud = zones.loud
-    if template.radius_px >= WIDE_PX and not template.slot:
+    if template.radius_px >= WIDE_PX and template.slot is None:
         most = FAINT * scatter(score, zones, np.zeros_like(loud)).deviations[-1]
         if cv2.norm(score, cv2.NORM_INF) > most:
             loud = loud | (np.abs(score) > most)

@@ -12,7 +12,8 @@ from detectors.findings.templates import (
     DENT_RADII_PX,
     RADII_PX,
     SIDES_PX,
-    SLOT_PX,
+    SLOT_LENGTHS_PX,
+    SLOT_WIDTH_PX,
     SLOTS_DEG,
     SMALL_RADII_PX,
     WINDOWS_PX,
@@ -46,13 +47,15 @@ def test_the_bank_holds_discs_dents_and_slots_coarse_ones_last(window_px: int) -
     templates = bank(window_px)
     coarse = [template.coarse for template in templates]
     assert coarse == sorted(coarse)
-    assert sum(template.slot for template in templates) == len(SLOTS_DEG)
+    slot_count = sum(template.slot is not None for template in templates)
+    assert slot_count == len(SLOT_LENGTHS_PX) * len(SLOTS_DEG)
     small = [template for template in templates if template.radius_px in SMALL_RADII_PX]
     assert len(small) == 4 * len(SMALL_RADII_PX)
     deep = [template for template in templates if template.radius_px == DEEP_PX]
     assert len(deep) == (4 if window_px == 3 else 0)
     for template in templates:
-        assert template.coarse == (template.slot or template.radius_px >= COARSE_PX)
+        is_slot = template.slot is not None
+        assert template.coarse == (is_slot or template.radius_px >= COARSE_PX)
         assert len(template.image) % 2 == 1
 
 
@@ -84,10 +87,12 @@ def test_a_dent_has_the_volume_of_a_paraboloid(radius_px: float) -> None:
 
 def test_slots_have_their_length_width_and_angle() -> None:
     slots = [template for template in bank(1) if template.slot]
-    length, width = SLOT_PX
-    for slot, angle_deg in zip(slots, SLOTS_DEG, strict=True):
-        assert slot.image.sum() == pytest.approx(length * width, rel=0.05)
-        assert slot.radius_px == length / 4
+    wanted = [(length, SLOT_WIDTH_PX, angle) for length in SLOT_LENGTHS_PX for angle in SLOTS_DEG]
+    assert [template.slot for template in slots] == wanted
+    for slot in slots:
+        length, width, angle_deg = slot.slot
+        assert slot.image.sum() == pytest.approx(length * width, rel=0.07)
+        assert slot.radius_px == pytest.approx(np.sqrt(length * width / np.pi))
         rows, columns = np.indices(slot.image.shape) - len(slot.image) // 2
         turned = (columns + 1j * rows) * np.exp(-1j * np.radians(angle_deg))
         # a lens of 0.6 pixels and the pixel itself add to the moments of the rectangle
@@ -166,6 +171,7 @@ def test_templates_with_fewer_independent_maxima_are_raised() -> None:
     """The density of maxima is the root of the product of the second moments of the whitened
     spectrum along both axes; the logarithm of its ratio raises the square of a score."""
     densities = []
+    slot_count = len(SLOT_LENGTHS_PX) * len(SLOTS_DEG)
     cycles = np.fft.fftfreq(GRID)
     for template in bank(5):
         power = np.abs(np.fft.fft2(template.image, (GRID, GRID))) ** 2
@@ -173,7 +179,7 @@ def test_templates_with_fewer_independent_maxima_are_raised() -> None:
             low = np.abs(cycles) <= 0.25
             power = power * np.outer(low, low)
         moments = (power.sum(axis=1) @ cycles**2) * (power.sum(axis=0) @ cycles**2)
-        densities.append(np.sqrt(moments) / power.sum() * (len(SLOTS_DEG) if template.slot else 1))
+        densities.append(np.sqrt(moments) / power.sum() * (slot_count if template.slot else 1))
     raised = np.array([worth.raised for worth in worths(WHITE, 5)])
     # relative to the narrowest disc, which is the first
     coarse = np.array([template.coarse for template in bank(5)])

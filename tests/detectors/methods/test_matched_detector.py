@@ -71,9 +71,9 @@ def detections_in(cloud: Cloud, threshold: float) -> tuple[Detection, ...]:
 
 def test_a_deep_hole_is_one_finding_and_two_that_touch_are_two() -> None:
     deep = hole(40, 45, 3.0, 0.03) + 3e-4 * blurred(5)
-    assert len(detections_in(cloud_of(deep), 5.0)) == 1
+    assert len(detections_in(cloud_of(deep), 5.5)) == 1
     touching = hole(40, 45, 3.0, 0.03) + hole(50, 45, 3.0, 0.03) + 3e-4 * blurred(6)
-    assert len(detections_in(cloud_of(touching), 5.0)) == 2
+    assert len(detections_in(cloud_of(touching), 5.5)) == 2
 
 
 def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
@@ -94,14 +94,14 @@ def test_a_slot_is_found_at_a_lower_depth_than_discs_find_it() -> None:
         fields = responses(coarse if bank(1)[numbers[0]].coarse else fine, pair)
         for channel, number in enumerate(numbers):
             score = float(fields[..., channel].max()) / energies[number] ** 0.5
-            scores[bank(1)[number].slot].append(score)
+            scores[bank(1)[number].slot is not None].append(score)
     depth = 7.5 / max(scores[True])
     assert depth * max(scores[False]) < 5.5
     for seed in (20, 21, 22):
         noise = np.random.default_rng(seed).standard_normal(SHAPE)
         (detection,) = detections_in(cloud_of(3e-4 * (noise + depth * slot)), 5.5)
-        row, column = np.unravel_index(detection.pixels[0], SHAPE)
-        assert np.hypot(row - 45.2, column - 60.4) < 8.0
+        rows, columns = np.unravel_index(detection.pixels, SHAPE)
+        assert np.hypot(rows.mean() - 45.2, columns.mean() - 60.4) < 2.0
 
 
 def test_the_error_of_a_hole_contains_what_the_model_does_not_explain() -> None:
@@ -311,12 +311,12 @@ def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
     assert not core.any()
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 45.0])
+@pytest.mark.parametrize("angle_deg", [0.0, 33.75, 45.0])
 def test_a_slot_has_a_higher_score_than_discs_and_dents_give_it(angle_deg: float) -> None:
     """A slot of the bank's own length and width under white noise: the best disc or dent would
     give it two thirds of its energy's root, and the slot itself gives more."""
     slots = [template.image for template in bank(1) if template.slot]
-    slot = slots[SLOTS_DEG.index(angle_deg)]
+    slot = slots[len(SLOTS_DEG) + SLOTS_DEG.index(angle_deg)]
     half = len(slot) // 2
     depth = np.zeros(SHAPE)
     depth[45 - half : 46 + half, 60 - half : 61 + half] = 25.0 * slot / np.sqrt((slot**2).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detectors.findings.templates import Template
+from detectors.findings.templates import SlotSides, Template
 from detectors.methods import scatter_reference as reference
 from detectors.methods.matched import _keep_stronger
 from detectors.methods.scatter import (
@@ -124,7 +124,8 @@ def test_scores_where_the_noise_is_higher_are_divided() -> None:
 
 @pytest.mark.parametrize("slot", [False, True])
 def test_strong_scores_of_wide_templates_do_not_count(slot: bool) -> None:
-    wide = Template(np.zeros((1, 1)), 5.0, slot=slot)
+    sides = SlotSides(24.0, 2.0, 0.0) if slot else None
+    wide = Template(np.zeros((1, 1)), 5.0, slot=sides)
     scores = noisy(6)
     scores[30:60, 30:90] = 50.0
     # of a slot's scores, the block of a fifth of the pixels counts as 2 each
