@@ -5,13 +5,16 @@ and averaged over a rectangle of pixels. Light that reaches depth t passes the m
 at depth t on its way in and out; in the image each is an ellipse that parallax shifts. The tube's
 length, as a share of the depth, is fitted too: the model's ``wall``.
 
+The lens and the camera's filter average, so the rectangle has the second moments of both. A filter
+may weigh pixels: a bilateral one gives deep neighbours less weight, and one that sums phasors gives
+each pixel that of its light (`HolePatch.half_m`, `HolePatch.brightness`).
+
 A hole is five numbers: u, v (px), radius, depth along the optical axis (m), and wall (0 to 1).
 `pictures` draws holes, `fit_hole` fits one. `detectors.findings.hole_model_reference` is the same
 model and the same least squares, written plainly.
 
-Not modelled: light between wall and floor, which makes a wall look deeper than it is; walls darker
-than the floor; a floor that is not flat; the lower weight of deep neighbours in a bilateral filter
-(holes of 2 to 3 times the blur are measured up to 16 % too deep at 33 mm)."""
+Not modelled: light between wall and floor, which makes holes of 33 mm look 4 % deeper; walls darker
+than the floor; a floor that is not flat; what weights do to other shapes than holes."""
 
 import math
 from dataclasses import dataclass
