@@ -5,13 +5,16 @@ and averaged over a rectangle of pixels. Light that reaches depth t passes the m
 at depth t on its way in and out; in the image each is an ellipse that parallax shifts. The tube's
 length, as a share of the depth, is fitted too: the model's ``wall``.
 
+The lens averages too, by a second rectangle. A filter may weigh pixels: a bilateral one gives deep
+neighbours less weight, and one that sums phasors gives each pixel that of its light
+(`HolePatch.half_m`, `HolePatch.brightness`).
+
 A hole is five numbers: u, v (px), radius, depth along the optical axis (m), and wall (0 to 1).
 `pictures` draws holes, `fit_hole` fits one. `detectors.findings.hole_model_reference` is the same
 model and the same least squares, written plainly.
 
-Not modelled: light between wall and floor, which makes a wall look deeper than it is; walls darker
-than the floor; a floor that is not flat; the lower weight of deep neighbours in a bilateral filter
-(holes of 2 to 3 times the blur are measured up to 16 % too deep at 33 mm)."""
+Not modelled: light between wall and floor, which makes holes of 33 mm look 4 % deeper; walls darker
+than the floor; a floor that is not flat; what weights do to other shapes than holes."""
 
 import math
 from dataclasses import dataclass
@@ -137,8 +140,9 @@ class HolePatch:
     if it weighs all alike."""
     half_m: float = math.inf
     """Difference in depth at which the filter gives a pixel half of the weight."""
-    sharp_px: tuple[float, float] = (1.0, 1.0)
-    """Sides of the rectangle over which the lens and a pixel average, before the filter does."""
+    lens_px: tuple[float, float] = (1.0, 1.0)
+    """Sides of the rectangle of pixels over which the lens averages, before the filter does; 1
+    where it is sharp (`lens_side`)."""
     shared_px: tuple[float, float] | None = None
     """Sides of the rectangle over which the noise is averaged; None: those of the blur."""
 
@@ -149,14 +153,23 @@ class HolePatch:
 
     @property
     def weighing(self) -> tuple[float, float, float, float]:
-        """Brightness, half depth and sharp sides as the kernels take them."""
-        sharp_u, sharp_v = self.sharp_px
-        return self.brightness, self.half_m, sharp_u, sharp_v
+        """Brightness, half depth and the lens' sides as the kernels take them."""
+        lens_u, lens_v = self.lens_px
+        return self.brightness, self.half_m, lens_u, lens_v
 
     @property
     def prior_weight(self) -> float:
         """Misfit in metres that corresponds to a deviation of the wall by 1."""
         return self.noise_m * math.sqrt(math.prod(self.noise_px)) / WALL_PRIOR[1]
+
+
+def lens_side(deviation_px: float) -> float:
+    """Return the side of the rectangle of pixels, each in parts, that has the second moment of a
+    blur: (s - 1) / s for sides up to 3, some (s^2 - 1) / 12 beyond."""
+    variance_px2 = deviation_px**2
+    if variance_px2 < 2.0 / 3.0:
+        return 1.0 / (1.0 - variance_px2)
+    return math.sqrt(12.0 * variance_px2 + 1.0)
 
 
 def pictures(patch: HolePatch, holes: np.ndarray, shape: Shape = "disc") -> np.ndarray:
@@ -491,14 +504,15 @@ def _drawn(  # type: ignore[no-untyped-def]
     w,
 ):
     """Return the `pictures` (m, h, w) of damages (m, 7) of a shape."""
-    images = _averaged(shape, holes, sights, metric, blur_u, blur_v, soft, h, w)
-    brightness, half, sharp_u, sharp_v = weighing
+    brightness, half, lens_u, lens_v = weighing
+    lens = (lens_u, lens_v)
+    images = _averaged(shape, holes, sights, metric, blur_u, blur_v, soft, lens, h, w)
     if shape != DISC or not (brightness > 0.0 or half < np.inf):
         return images
-    sharp = _averaged(shape, holes, sights, metric, sharp_u, sharp_v, False, h, w)
+    sharp = _averaged(shape, holes, sights, metric, 1.0, 1.0, False, lens, h, w)
     mouths = holes.copy()
     mouths[:, 3] = -1.0
-    faces = 1.0 + _averaged(shape, mouths, sights, metric, blur_u, blur_v, soft, h, w)
+    faces = 1.0 + _averaged(shape, mouths, sights, metric, blur_u, blur_v, soft, lens, h, w)
     for n in range(len(images)):
         if holes[n, 3] > 0.0:
             _weigh(images[n], sharp[n], faces[n], holes[n, 3], brightness, half)
@@ -514,6 +528,7 @@ def _averaged(  # type: ignore[no-untyped-def]
     blur_u,
     blur_v,
     soft,
+    lens,
     h,
     w,
 ):
@@ -529,6 +544,11 @@ def _averaged(  # type: ignore[no-untyped-def]
         for n in range(len(images)):
             _smooth_rows(images[n], blur_u)
             _smooth_rows(images[n].T, blur_v)
+    lens_u, lens_v = lens
+    if lens_u > 1.0 or lens_v > 1.0:
+        for n in range(len(images)):
+            _smooth_rows(images[n], lens_u)
+            _smooth_rows(images[n].T, lens_v)
     return images
 
 

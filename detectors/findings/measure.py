@@ -16,6 +16,7 @@ from pydantic import Field, field_validator
 from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
+    lens_side,
     normal_of,
     pictures,
     sight,
@@ -393,8 +394,6 @@ def _surroundings(
         v0 = (v0 + 0.5) / binned - 0.5
         blur_u, blur_v = blur_px
         blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
-    blur_u, blur_v = blur_px
-    lens_u, lens_v = _lens_sides(cloud, config, blur_px)
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     widened = grown(detected, reach_px + 1)
@@ -417,10 +416,10 @@ def _surroundings(
         residual_m=residual_m,
         used=used,
         metric_m2=per_px_m @ per_px_m.T,
-        blur_px=(math.hypot(blur_u, lens_u), math.hypot(blur_v, lens_v)),
+        blur_px=blur_px,
+        lens_px=_lens_sides(cloud, config, blur_px),
         brightness=1.0 if config.by_light else 0.0,
         half_m=math.inf if cloud.noise_reach_px else config.linear_depth_mm * MM,
-        sharp_px=(math.hypot(1.0, lens_u), math.hypot(1.0, lens_v)),
         noise_m=noise_m,
         sights=_sights(cloud, origin_m, per_px_m, config),
         shared_px=blur_px,
@@ -510,14 +509,14 @@ def _lens_sides(
     config: HoleModelConfig,
     blur_px: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the sides of the rectangle with the second moments of the lens' blur, in the pixels in
-    which the camera's filter has the sides ``blur_px``. They are 0 for a recording, whose blur is
-    estimated: `BLURS` allow for its lens."""
+    """Return the `lens_side` along u and along v, in the pixels in which the camera's filter has
+    the sides ``blur_px``. They are 1 for a recording, whose blur is estimated: `BLURS` allow for
+    its lens."""
     if cloud.noise_reach_px:
-        return 0.0, 0.0
+        return 1.0, 1.0
     blur_u, blur_v = blur_px
-    per_blur = math.sqrt(12.0) * config.lens_px / config.blur_px
-    return per_blur * blur_u, per_blur * blur_v
+    per_blur = config.lens_px / config.blur_px
+    return lens_side(per_blur * blur_u), lens_side(per_blur * blur_v)
 
 
 def _binned_blur(blur_px: float, binned: int) -> float:

@@ -13,7 +13,9 @@ from detectors.findings import hole_model_reference as reference
 from detectors.findings.hole_model import (
     WALL_PRIOR,
     HolePatch,
+    _smooth_rows,
     fit_hole,
+    lens_side,
     pictures,
     sandwich_covariance,
     sight,
@@ -108,6 +110,19 @@ def test_pictures_of_several_holes_are_those_of_each():
         reference.picture(patch, holes[1]),
         atol=2e-4,
     )
+
+
+@pytest.mark.parametrize("deviation_px", [0.0, 0.45, 0.81, 0.82, 1.5, 4.0])
+def test_a_lens_rectangle_has_the_second_moment_of_its_blur(deviation_px: float) -> None:
+    """Means over rows of pixels, of which the last ones count in parts; beyond sides of 3 pixels,
+    these parts leave 7 %."""
+    row = np.zeros((1, 41))
+    row[0, 20] = 1.0
+    _smooth_rows(row, lens_side(deviation_px))
+    moment_px2 = float(row[0] @ (np.arange(41) - 20.0) ** 2)
+    assert row.sum() == pytest.approx(1.0)
+    error = 1e-9 if deviation_px < 0.82 else 0.07
+    assert moment_px2 == pytest.approx(deviation_px**2, rel=error, abs=1e-12)
 
 
 def pixels_of(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@ simulation."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -430,6 +431,47 @@ def test_the_depth_of_a_hole_that_hides_its_floor_is_a_lower_bound() -> None:
         by_contour = measured(deep, 0.2, 3, config=HoleModelConfig())
         assert "contour" in by_contour.model_note
         assert by_contour.depth_is_least == (diameter_mm < 10.0)
+
+
+def test_the_lens_widens_the_picture_and_not_the_noise() -> None:
+    """A lens with a deviation of 0.6 pixels before a filter of 5 x 5: without it, a hole of three
+    pixels looks an eighth wider."""
+    board = Board(5.0, 12.7)
+    board.image = cv2.GaussianBlur(board.image, (9, 9), 0.6)
+    stated = HoleModelConfig(lens_px=0.6, linear_depth_mm=1e5)
+    known = measured(board, 0.005, 1, config=stated)
+    assert known.model_diameter_m == pytest.approx(5.0e-3, rel=0.02)
+    assert measured(board, 0.005, 1).model_diameter_m > 1.06 * 5.0e-3
+    cloud, evidence = board.seen(0.005, 1)
+    detection = strongest(cloud, evidence, 5.0)
+    around = _surroundings(cloud, evidence, detection, stated)
+    assert around is not None
+    assert around.patch.noise_px == (5.0, 5.0)
+    assert around.patch.blur_px == (5.0, 5.0)
+    assert around.patch.lens_px == pytest.approx((1.0 / 0.64, 1.0 / 0.64))
+
+
+def test_a_filter_is_stated_by_the_settings_except_that_of_a_recording() -> None:
+    board = Board(12.7, 12.7)
+    cloud, evidence = board.seen(0.1, 1)
+    detection = strongest(cloud, evidence, 5.0)
+
+    def patch(cloud: Cloud, config: HoleModelConfig) -> HolePatch:
+        around = _surroundings(cloud, evidence, detection, config)
+        assert around is not None
+        return around.patch
+
+    plain = patch(cloud, HoleModelConfig(emitter_mm=(-80.0, 0.0, 0.0)))
+    by_light = patch(cloud, HoleModelConfig(emitter_mm=(-80.0, 0.0, 0.0), by_light=True))
+    assert (plain.brightness, by_light.brightness) == (0.0, 1.0)
+    assert plain.half_m == pytest.approx(75e-3)
+    # the emitter's beam matters to a filter by light alone
+    at_lens = patch(cloud, HoleModelConfig(emitter_mm=(0.0, 0.0, 0.0), by_light=True))
+    np.testing.assert_array_equal(plain.sights, at_lens.sights)
+    assert abs(by_light.sights[0, 4] - at_lens.sights[0, 4]) > 10.0
+    recording = patch(replace(cloud, noise_reach_px=5.0), HoleModelConfig())
+    assert recording.half_m == math.inf
+    assert recording.lens_px == (1.0, 1.0)
 
 
 def test_a_deep_hole_falls_back_to_its_contour() -> None:

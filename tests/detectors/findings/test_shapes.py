@@ -166,6 +166,25 @@ def test_no_hollow_of_a_smooth_shape_is_deeper_than_its_radius(
     assert (shape in weights) is is_possible
 
 
+def test_a_dim_floor_does_not_narrow_a_hole_where_light_weighs() -> None:
+    """A floor of half the face's light, between two of those tried: taken for as bright, the hole is
+    a tenth too narrow."""
+    blank = replace(patch_of(FRONTAL_PX_M), blur_px=(3.0, 3.0), brightness=0.5)
+    truth = np.array([19.3, 17.6, 5e-3, 33e-3, 0.2, 0.0, 0.0])
+    draws = np.random.default_rng(3).standard_normal(blank.used.shape)
+    seen_m = pictures(blank, truth[None])[0] + cv2.blur(draws, (3, 3)) * 3.0 * 1e-4
+    start = Start(19.0, 18.0, 4.5e-3, 30e-3, 0.0, 0.0, 0.0)
+    by_light = replace(blank, residual_m=seen_m, brightness=1.0)
+    size = sized(by_light, start, ("disc",), BLURS[:1])
+    assert size is not None
+    assert size.best.shape == "disc"
+    assert abs(size.diameter_m - 10e-3) < 2.0 * size.diameter_se_m < 2e-3
+    assert size.diameter_m == pytest.approx(10e-3, rel=0.04)
+    alike = sized(replace(by_light, brightness=0.0), start, ("disc",), BLURS[:1])
+    assert alike is not None
+    assert alike.diameter_m < 0.95 * 10e-3
+
+
 def test_a_mixture_has_the_variance_within_and_between() -> None:
     mean, deviation = mixture(np.array([0.75, 0.25]), np.array([4.0, 8.0]), np.array([1.0, 2.0]))
     assert mean == pytest.approx(5.0)
