@@ -1,12 +1,14 @@
 """Virtual damage for a real scan: the change that a damage would make to a camera's measurement.
 
-A small board is placed where the scan's surface is and is rendered with and without the damage.
-The camera's model turns both renders into frames with the same random numbers; recorded frames
-keep their own errors.
+A flat board as large as the scanned part is placed in the tangent plane at the damage, and the
+pixels around the damage are rendered with and without it. The board's size matters: light that
+passes the edges of a smaller one reaches what lies behind the damage, and shows it too deep where
+the camera looks at it obliquely. The camera's model turns both renders into frames with the same
+random numbers; recorded frames keep their own errors.
 
-Not modelled: the surface's curvature within the small board, texture at the damage, light that
-reaches it by way of other surfaces, and damage that lowers noise: recorded noise is never removed.
-Ranges are not rounded again."""
+Not modelled: the part's curvature and openings, texture at the damage, light that reaches it by
+way of other objects, and damage that lowers noise: recorded noise is never removed. Ranges are not
+rounded again."""
 
 import warnings
 from dataclasses import dataclass
@@ -15,11 +17,13 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
-from scenes.sensor.camera import camera_of, number_paths, numbers_of_lens
+from scenes.sensor.camera import AnyCamera, camera_of, number_paths, numbers_of_lens
 from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
@@ -30,10 +34,25 @@ LEAST_DRAWS = 48
 FINEST_STEP_MM = 1e-3
 # pixels beyond the reach of the camera's filter around the damage's rim that may change
 BEYOND_PX = 2
-AROUND_PX = 8  # further pixels of the small board; its rim disturbs both renders alike
+NEAREST_M = 0.1  # z of the board's nearest point, from which poses are legal
+# a board reaches at least so many times as far from the damage's centre as the damage does
+LEAST_BOARD = 2.0
+CIRCLE_STEPS = 64  # points of the circle around a damage of which the pixels are found
 KINDS = ("holes", "dents", "flaws")  # fields of a declaration that list damage
 # of the camera: what a recording does not contain already
 DRAWN_EFFECTS = ("noise", "multipath", "wiggling", "ambient", "saturation")
+
+
+@dataclass(frozen=True, eq=False)
+class PartFace:
+    """The face of a scanned part: a rectangle about the part in a plane."""
+
+    T_camera_part: np.ndarray
+    """(4, 4): from the plane's frame, z towards the camera, to the camera's."""
+    low_m: np.ndarray
+    """(2,): least x and y of the part in the plane."""
+    high_m: np.ndarray
+    """(2,): its largest x and y."""
 
 
 @dataclass(frozen=True)
@@ -91,27 +110,46 @@ def unit_config(name: str, lens: Lens) -> tuple[CameraConfig, bool]:
     return config, same
 
 
-def local_board(
+def tangent_board(
     target: custom.TargetConfig,
     damage: custom.AnyDamage,
+    part: PartFace,
     place_m: np.ndarray,
     normal: np.ndarray,
-    side_mm: float,
 ) -> custom.TargetConfig:
-    """Return a board of ``target``'s material with this damage alone at its centre, which lies at
-    ``place_m`` (3,) in the camera's frame, its face towards ``normal`` (3,), a unit vector to the
-    camera."""
-    x, y, z = normal * [1.0, -1.0, -1.0]
+    """Return a flat board of ``target``'s material, as large as the part, with this damage alone
+    where it lies on the part: at ``place_m`` (3,) in the camera's frame. Its face is turned
+    towards ``normal`` (3,), a unit vector to the camera. Of a part that reaches too near to the
+    camera, the board is smaller on all sides."""
+    along = part.T_camera_part[:3, 0]
+    along = along - (along @ normal) * normal
+    along /= np.linalg.norm(along)
+    axes = np.column_stack([along, np.cross(normal, along), normal])
+    low_m = part.low_m - damage.centre_m
+    high_m = part.high_m - damage.centre_m
+    nearest_m = np.minimum(axes[2, :2] * low_m, axes[2, :2] * high_m).sum()
+    room_m = place_m[2] - NEAREST_M
+    share = min(1.0, room_m / max(-nearest_m, MM))
+    least_m = LEAST_BOARD * damage.reach_mm * MM
+    low_m = np.minimum(share * low_m, -least_m)
+    high_m = np.maximum(share * high_m, least_m)
+    middle_m = (low_m + high_m) / 2
+    centre_m = place_m + axes[:, :2] @ middle_m
+    unturned = np.diag([1.0, -1.0, -1.0]) @ axes
+    tilt_x_deg, tilt_y_deg, roll_deg = Rotation.from_matrix(unturned).as_euler("xyz", degrees=True)
     pose = custom.PoseConfig(
-        distance_m=float(place_m[2]),
-        offset_x_mm=float(place_m[0]) / MM,
-        offset_y_mm=float(place_m[1]) / MM,
-        tilt_x_deg=float(np.degrees(np.arcsin(-y))),
-        tilt_y_deg=float(np.degrees(np.arctan2(x, z))),
+        distance_m=float(centre_m[2]),
+        offset_x_mm=float(centre_m[0]) / MM,
+        offset_y_mm=float(centre_m[1]) / MM,
+        tilt_x_deg=float(tilt_x_deg),
+        tilt_y_deg=float(tilt_y_deg),
+        roll_deg=float(roll_deg),
     )
-    alone = damage.model_copy(update={"centre_mm": (0.0, 0.0)})
+    width_mm, height_mm = ((high_m - low_m) / MM).tolist()
+    off_x_mm, off_y_mm = (-middle_m / MM).tolist()
+    alone = damage.model_copy(update={"centre_mm": (off_x_mm, off_y_mm)})
     changed: dict[str, Any] = {
-        "board": target.board.model_copy(update={"width_mm": side_mm, "height_mm": side_mm}),
+        "board": target.board.model_copy(update={"width_mm": width_mm, "height_mm": height_mm}),
         "pose": pose,
     }
     if target.backing is not None:
@@ -131,13 +169,15 @@ def implant_of(
     seed: int,
     cache: Path,
 ) -> Implant:
-    """Return the difference that the damage of `local_board` makes to ``frames`` frames (or more)
-    of a recording with this lens. ``config``, ``same``: those of `unit_config`. Raises UserError
-    if the board leaves the view."""
+    """Return the difference that the damage of `tangent_board` makes to ``frames`` frames (or
+    more) of a recording with this lens. ``config``, ``same``: those of `unit_config`. Raises
+    UserError if the damage is out of the camera's view."""
     camera = camera_of(config)
+    reached = _reached_disc(camera, board)
+    region = reached.region(camera.nominal_lens)
     damaged = board.at_wavelength(camera.optics.wavelength_nm)
-    unit, drawn_m, smooth_m = _drawn(config, damaged, frames, seed, cache)
-    _, drawn_whole_m, smooth_whole_m = _drawn(config, damaged.hole_free(), frames, seed, cache)
+    drawn_m, smooth_m = _drawn(config, damaged, region, frames, seed, cache)
+    drawn_whole_m, smooth_whole_m = _drawn(config, damaged.hole_free(), region, frames, seed, cache)
     with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame shows
         mean_m = np.nanmean(drawn_m, axis=0)
@@ -149,15 +189,14 @@ def implant_of(
         ratio = np.nanvar(drawn_whole_m, axis=0) / np.nanvar(drawn_m, axis=0)
         added_share = np.sqrt(np.clip(1.0 - ratio, 0.0, 1.0))
         added_noise_m = added_share * (drawn_m - mean_m)
-    near_damage = _near_damage(unit, board)
-    region = unit.region
+    near_damage = reached.holds(camera.nominal_lens.region_slopes(region))
     shift_m = np.where(near_damage, np.nan_to_num(middle_m - middle_whole_m), 0.0)
     noise_m = np.where(near_damage, np.nan_to_num(added_noise_m), 0.0)
     lost = near_damage & np.isnan(drawn_m) & np.isfinite(drawn_whole_m)
     if same:
         return Implant(region, shift_m, noise_m, lost)
     # the recording is aligned to other pixels: interpolate between the camera's pixels
-    onto = _region_of_board(lens, board)
+    onto = reached.region(lens)
     rays = np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1)
     pixels = camera.nominal_lens.project(rays)
     rows_columns = [pixels[..., 1] - region.row0, pixels[..., 0] - region.col0]
@@ -173,14 +212,17 @@ def implant_of(
 def _drawn(
     config: CameraConfig,
     target: custom.TargetConfig,
+    region: Region,
     frames: int,
     seed: int,
     cache: Path,
-) -> tuple[SimulatedUnit, np.ndarray, np.ndarray]:
-    """Return a unit of the camera before the target, z (t, h, w) of frames, and z (h, w) without
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (t, h, w) of frames of the target on a region of the camera, and z (h, w) without
     noise."""
     camera = camera_of(config)
-    view, _ = cached_view(target, camera.optics, RenderConfig(), cache)
+    lens = camera.nominal_lens
+    lit = region.grown(camera.optics.margin_px, lens.height, lens.width)
+    view, _ = cached_view(target, camera.optics, RenderConfig(), cache, lit)
     unit = SimulatedUnit(camera, config, view)
     capture = unit.capture(max(frames, LEAST_DRAWS), seed, "implant")
     drawn_m = np.stack([frame.z_m for frame in capture.frames()]).astype(float)
@@ -188,44 +230,56 @@ def _drawn(
     quiet_config = config.model_copy(update={"effects": without_noise})
     quiet = SimulatedUnit(camera, quiet_config, view)
     smooth_m = next(quiet.capture(1, seed).frames()).z_m.astype(float)
-    return unit, drawn_m, smooth_m
+    return drawn_m, smooth_m
 
 
-def _region_of_board(lens: Lens, board: custom.TargetConfig) -> Region:
-    """Return the pixels of a lens on which the small board lies."""
-    half_m = board.board.width_mm / 2 * MM
-    corners = np.array([(x, y, 0.0) for x in (-half_m, half_m) for y in (-half_m, half_m)])
-    pixels = lens.project(transform_points(board.pose.T_camera_board, corners))
-    left, top = np.floor(pixels.min(axis=0)).astype(int)
-    right, bottom = np.ceil(pixels.max(axis=0)).astype(int)
-    return Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
+@dataclass(frozen=True, eq=False)
+class _ReachedDisc:
+    """The part of a board's face that its damage may change through the camera's filter: a
+    disc."""
+
+    centre_m: np.ndarray
+    """(3,): its centre, camera frame."""
+    axes: np.ndarray
+    """(3, 3): unit vectors along its plane, and its normal towards the camera, in columns."""
+    radius_m: float
+    """Its radius."""
+
+    def region(self, lens: Lens) -> Region:
+        """Return the pixels of a lens on which it lies, cut at the sensor's edges. Raises
+        UserError if its centre is out of view."""
+        if not lens.images(self.centre_m):
+            raise UserError(
+                "damage is out of the camera's view",
+                fix="name the camera and the depth mode that took the capture",
+            )
+        angle = np.linspace(0.0, 2 * np.pi, CIRCLE_STEPS, endpoint=False)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        rim_m = self.centre_m + self.radius_m * circle @ self.axes[:, :2].T
+        pixels = lens.project(rim_m)
+        left, top = np.floor(pixels.min(axis=0)).astype(int).tolist()
+        right, bottom = np.ceil(pixels.max(axis=0)).astype(int).tolist()
+        return Region(top, bottom + 1, left, right + 1).grown(0, lens.height, lens.width)
+
+    def holds(self, slopes: np.ndarray) -> np.ndarray:
+        """Return (h, w) bool: which rays with these slopes (h, w, 2) meet it."""
+        rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+        normal = self.axes[:, 2]
+        on_plane = rays * ((self.centre_m @ normal) / (rays @ normal))[..., None]
+        apart_m = np.linalg.norm(on_plane - self.centre_m, axis=-1)
+        return np.asarray(apart_m < self.radius_m)
 
 
-def side_mm(
-    damage: custom.AnyDamage,
-    distance_m: float,
-    config: CameraConfig,
-) -> float:
-    """Return the side of a board with space for a damage, the reach of the camera's filter around
-    it, and a rim."""
-    camera = camera_of(config)
-    lens = camera.nominal_lens
-    pitch_mm = distance_m / MM / min(lens.fx, lens.fy)
-    rim_px = camera.optics.margin_px + BEYOND_PX + AROUND_PX
-    return 2 * damage.reach_mm + 2 * rim_px * pitch_mm
-
-
-def _near_damage(unit: SimulatedUnit, board: custom.TargetConfig) -> np.ndarray:
-    """Return (h, w) bool: pixels of the unit's region that the damage may change through the
-    camera's filter."""
+def _reached_disc(camera: AnyCamera, board: custom.TargetConfig) -> _ReachedDisc:
+    """Return what the only damage of a flat board may change."""
     (damage,) = board.damages
     T_camera_board = board.pose.T_camera_board
-    slopes = unit.view.slopes[unit.cut]
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    normal = T_camera_board[:3, 2]
-    centre = T_camera_board[:3, 3]
-    on_plane = rays * ((centre @ normal) / (rays @ normal))[..., None]
-    lens = unit.camera.nominal_lens
-    reach_m = (unit.camera.optics.margin_px + BEYOND_PX) * float(centre[2]) / min(lens.fx, lens.fy)
-    apart_m = np.linalg.norm(on_plane - centre, axis=-1)
-    return np.asarray(apart_m < damage.reach_mm * MM + reach_m)
+    centre_m = transform_points(T_camera_board, np.array([*damage.centre_m, 0.0]))
+    lens = camera.nominal_lens
+    pitch_m = float(centre_m[2]) / min(lens.fx, lens.fy)
+    reach_px = camera.optics.margin_px + BEYOND_PX
+    return _ReachedDisc(
+        centre_m=centre_m,
+        axes=T_camera_board[:3, :3],
+        radius_m=damage.reach_mm * MM + reach_px * pitch_m,
+    )

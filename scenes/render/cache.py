@@ -45,17 +45,19 @@ def render_key(
     target: TargetConfig,
     optics: Optics,
     config: RenderConfig,
+    region: Region | None = None,
 ) -> str:
     """Return the digest of all inputs of a render: target, the camera's optics (not its engine),
-    effort and code."""
-    return digest(
-        {
-            "code": source_digest(CODE, PACKAGES),
-            "target": target.to_data(),
-            "optics": optics.content(),
-            "render": config.to_data(),
-        }
-    )
+    effort, code, and the region unless it is that of the target."""
+    inputs = {
+        "code": source_digest(CODE, PACKAGES),
+        "target": target.to_data(),
+        "optics": optics.content(),
+        "render": config.to_data(),
+    }
+    if region is not None:
+        inputs["region"] = asdict(region)
+    return digest(inputs)
 
 
 def cached_view(
@@ -63,11 +65,12 @@ def cached_view(
     optics: Optics,
     config: RenderConfig,
     folder: Path,
+    region: Region | None = None,
 ) -> tuple[NoiseFreeView, bool]:
-    """Return the view of a declared target, and whether it came from the cache. If another process
-    renders it, wait for that. Raises UserError as `build_target` and `render_view` do, and if the
-    folder cannot be written."""
-    key = render_key(target, optics, config)
+    """Return the view of a declared target on ``region`` or on that of the target, and whether it
+    came from the cache. If another process renders it, wait for that. Raises UserError as
+    `build_target` and `render_view` do, and if the folder cannot be written."""
+    key = render_key(target, optics, config, region)
     path = folder / f"{key}.npz"
     stored = read_view(path)
     if stored is not None:
@@ -81,7 +84,7 @@ def cached_view(
         from scenes.render.view import render_view  # with trimesh, which no trial needs
         from scenes.target.mesh import build_target
 
-        view = render_view(build_target(target), optics, config)
+        view = render_view(build_target(target), optics, config, region)
         write_view(path, view)
         return view, False
 

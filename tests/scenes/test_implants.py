@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
 from scenes import implants
 from scenes.closed_form import plane_view
-from scenes.implants import Implant, implant_of, local_board, side_mm, unit_config
-from scenes.optics import NoiseFreeView
+from scenes.implants import Implant, PartFace, implant_of, tangent_board, unit_config
+from scenes.optics import NoiseFreeView, RenderConfig
+from scenes.render.cache import cached_view
 from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
+from scenes.target.truth import outline_board_m
 
 CAMERA = "azure_kinect_nfov_binned"
 TARGET = custom.TargetConfig(
@@ -97,30 +100,68 @@ def test_a_unit_has_the_recordings_lens_where_its_size_is_the_cameras() -> None:
         assert camera_of(config).nominal_lens.fx == pytest.approx(lens.fx)
 
 
-def test_a_local_board_has_one_damage_at_its_centre_where_it_lies() -> None:
-    board = local_board(TARGET, TARGET.holes[1], PLACE_M, NORMAL, side_mm=70.0)
+def part_face(normal: np.ndarray = NORMAL) -> PartFace:
+    """A part 300 x 200 mm in size in a plane with this normal, through PLACE_M at (60, 5) mm: the
+    camera's x axis lies in the plane's x and z."""
+    along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    along /= np.linalg.norm(along)
+    T_camera_part = np.eye(4)
+    T_camera_part[:3, :3] = np.column_stack([along, np.cross(normal, along), normal])
+    T_camera_part[:3, 3] = PLACE_M - T_camera_part[:3, :2] @ [60.0 * MM, 5.0 * MM]
+    return PartFace(T_camera_part, np.array([-0.15, -0.1]), np.array([0.15, 0.1]))
+
+
+def test_a_tangent_board_is_the_part_with_one_damage_where_it_lies() -> None:
+    part = part_face()
+    board = tangent_board(TARGET, TARGET.holes[1], part, PLACE_M, NORMAL)
     (damage,) = board.damages
     assert damage.id == 4
-    assert damage.centre_mm == (0.0, 0.0)
+    assert damage.centre_mm == pytest.approx((60.0, 5.0))
     assert board.dents == ()
-    assert (board.board.width_mm, board.board.height_mm) == (70.0, 70.0)
+    assert (board.board.width_mm, board.board.height_mm) == pytest.approx((300.0, 200.0))
     assert board.backing is not None
     assert board.backing.size_mm is None
-    T_camera_board = board.pose.T_camera_board
-    assert T_camera_board[:3, 3] == pytest.approx(PLACE_M)
-    assert T_camera_board[:3, 2] == pytest.approx(NORMAL)
+    assert board.pose.T_camera_board == pytest.approx(part.T_camera_part)
     bare = TARGET.model_copy(update={"backing": None})
-    assert local_board(bare, TARGET.dents[0], PLACE_M, NORMAL, 70.0).backing is None
+    assert tangent_board(bare, TARGET.dents[0], part, PLACE_M, NORMAL).backing is None
 
 
-def test_a_small_board_has_room_for_damage_filter_and_rim() -> None:
-    """12 mm of damage, and on both sides the filter's reach and 2 + 8 pixels of 0.6 m / f."""
-    config, _ = unit_config(CAMERA, own_lens())
-    camera = camera_of(config)
-    lens = camera.nominal_lens
-    rim_px = camera.optics.margin_px + 10
-    expected_mm = 12.0 + 2 * rim_px * 600.0 / min(lens.fx, lens.fy)
-    assert side_mm(TARGET.holes[0], 0.6, config) == pytest.approx(expected_mm)
+def test_a_tangent_board_is_no_centred_square_and_may_turn_off_the_plane() -> None:
+    """The part reaches from -100 to 150 and from -100 to 50 mm, and the surface is tilted further
+    at the damage."""
+    part = part_face()
+    wider = PartFace(part.T_camera_part, np.array([-0.1, -0.1]), np.array([0.15, 0.05]))
+    turned = np.array([0.3, -0.1, -1.0])
+    turned /= np.linalg.norm(turned)
+    board = tangent_board(TARGET, TARGET.holes[1], wider, PLACE_M, turned)
+    (damage,) = board.damages
+    assert (board.board.width_mm, board.board.height_mm) == pytest.approx((250.0, 150.0))
+    assert damage.centre_mm == pytest.approx((60.0 - 25.0, 5.0 + 25.0))
+    T_camera_board = board.pose.T_camera_board
+    assert T_camera_board[:3, 2] == pytest.approx(turned)
+    # the board's x axis is that of the part, turned into the tangent plane
+    across = np.cross(turned, part.T_camera_part[:3, 0])
+    assert T_camera_board[:3, 0] @ across == pytest.approx(0.0, abs=1e-9)
+    assert T_camera_board[:3, 0] @ part.T_camera_part[:3, 0] > 0.9
+    place_m = transform_points(T_camera_board, np.array([*damage.centre_m, 0.0]))
+    assert place_m == pytest.approx(PLACE_M)
+
+
+def test_a_tangent_board_ends_before_the_camera_and_beyond_the_damage() -> None:
+    """At 60 degrees a plate of 4 m would reach behind the lens; a damage at the rim of the part as
+    its plane has it stays inside the board."""
+    steep = np.array([-np.sin(np.radians(60.0)), 0.0, -np.cos(np.radians(60.0))])
+    part = part_face()
+    large = PartFace(part.T_camera_part, np.array([-2.0, -0.1]), np.array([2.0, 0.1]))
+    board = tangent_board(TARGET, TARGET.holes[1], large, PLACE_M, steep)
+    corners = transform_points(board.pose.T_camera_board, outline_board_m(board.board))
+    nearest_m = corners[:, 2].min()
+    assert nearest_m == pytest.approx(implants.NEAREST_M)
+    narrow = PartFace(part.T_camera_part, np.array([-0.1, -0.1]), np.array([0.061, 0.1]))
+    board = tangent_board(TARGET, TARGET.holes[1], narrow, PLACE_M, NORMAL)
+    (damage,) = board.damages
+    room_mm = board.board.width_mm / 2 - damage.centre_mm[0]
+    assert room_mm == pytest.approx(implants.LEAST_BOARD * 4.5)
 
 
 def test_an_implant_moves_frames_and_loses_their_pixels() -> None:
@@ -172,8 +213,9 @@ def planes(monkeypatch: pytest.MonkeyPatch) -> dict[bool, tuple[float, float]]:
     3 mm farther away with it, and darker, hence noisier."""
     declared = {True: (0.603, 0.2), False: (0.6, 0.6)}
 
-    def view(target: custom.TargetConfig, *_: Any) -> tuple[Any, bool]:
-        return seen_plane(*declared[bool(target.damages)]), False
+    def view(target: custom.TargetConfig, *rest: Any) -> tuple[Any, bool]:
+        camera = camera_of(unit_config(CAMERA, own_lens())[0])
+        return plane_view(camera, rest[-1], *declared[bool(target.damages)]), False
 
     monkeypatch.setattr(implants, "cached_view", view)
     return declared
@@ -184,7 +226,7 @@ FACING = np.array([0.0, 0.0, -1.0])
 
 def test_the_difference_between_two_views(planes: dict, tmp_path: Path) -> None:
     config, same = unit_config(CAMERA, own_lens())
-    board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
+    board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
     implant = implant_of(
         config,
         same,
@@ -243,7 +285,7 @@ def test_what_the_camera_loses_before_the_damage_is_lost(
     tmp_path: Path,
 ) -> None:
     config, same = unit_config(CAMERA, own_lens())
-    board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
+    board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
     planes[True] = (0.6, 0.0)
     implant = implant_of(
         config,
@@ -254,7 +296,9 @@ def test_what_the_camera_loses_before_the_damage_is_lost(
         3,
         tmp_path,
     )
-    assert 100 < implant.lost[0].sum() < implant.lost[0].size / 2
+    lens = own_lens()
+    reach_px = 6.0 * MM / 0.6 * lens.fx + camera_of(config).optics.margin_px + 2
+    assert implant.lost[0].sum() == pytest.approx(np.pi * reach_px**2, rel=0.05)
     planes[True] = (0.6, 0.6)
     planes[False] = (0.6, 0.0)
     assert not implant_of(
@@ -285,7 +329,7 @@ def test_a_recording_of_other_pixels_gets_the_difference_between_them(
     )
     config, same = unit_config(CAMERA, larger)
     assert not same
-    board = local_board(TARGET, TARGET.holes[0], PLACE_M, FACING, side_mm=100.0)
+    board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
     fine = implant_of(
         config,
         same,
@@ -304,10 +348,81 @@ def test_a_recording_of_other_pixels_gets_the_difference_between_them(
         3,
         tmp_path,
     )
-    side_px = 100.0 * MM / 0.6 * larger.fx
+    margin_px = camera_of(config).optics.margin_px
+    side_px = 12.0 * MM / 0.6 * larger.fx + 2 * 2 * (margin_px + 2)
     assert fine.region.shape == pytest.approx((side_px, side_px), abs=2)
     assert fine.shift_m.shape == fine.region.shape
     assert fine.noise_m.shape == (implants.LEAST_DRAWS, *fine.region.shape)
     assert fine.shift_m.sum() == pytest.approx(4 * coarse.shift_m.sum(), rel=0.05)
     row, col = (np.array(fine.region.shape) / 2).astype(int)
     assert fine.shift_m[row, col] == pytest.approx(3e-3, abs=2e-4)
+
+
+def test_damage_beside_the_cameras_view_is_refused(tmp_path: Path) -> None:
+    config, same = unit_config(CAMERA, own_lens())
+    aside_m = np.array([1.0, 0.0, 0.6])
+    board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), aside_m, FACING)
+    with pytest.raises(UserError, match="out of the camera's view"):
+        implant_of(
+            config,
+            same,
+            own_lens(),
+            board,
+            10,
+            3,
+            tmp_path,
+        )
+
+
+OFF_AXIS_MM = (0.0, 150.0)
+"""Places of holes 0.25 m before a camera of a wide view: on the axis, and 31 degrees off it."""
+
+
+@pytest.mark.parametrize("x_mm", OFF_AXIS_MM)
+def test_an_implant_is_as_deep_as_the_hole_in_the_whole_plate(x_mm: float, tmp_path: Path) -> None:
+    """Off the axis, a board of 60 mm shows it 1.2 to 1.6 times too deep: light that passes its
+    edges reaches what lies behind the hole."""
+    name = "azure_kinect_wfov_binned"
+    lens = camera_of(CameraConfig(name=name)).nominal_lens
+    config, same = unit_config(name, lens)
+    camera = camera_of(config)
+    hole = custom.HoleConfig(
+        id=1,
+        diameter_mm=5.0,
+        centre_mm=(x_mm, 0.0),
+    )
+    plate = custom.TargetConfig(
+        board=custom.BoardConfig(
+            width_mm=500.0,
+            height_mm=300.0,
+            thickness_mm=12.7,
+            shape=custom.FlatConfig(),
+        ),
+        holes=(hole,),
+        backing=custom.BackingConfig(distance_mm=20.0),
+        material=custom.MaterialConfig(grain_contrast=0.0),
+        pose=custom.PoseConfig(distance_m=0.25),
+    )
+    quiet = config.effects.model_copy(update={"noise": False})
+    z_m = []
+    for target in (plate, plate.hole_free()):
+        view, _ = cached_view(target, camera.optics, RenderConfig(), tmp_path)
+        unit = SimulatedUnit(camera, config.model_copy(update={"effects": quiet}), view)
+        z_m.append(next(unit.capture(1, 1).frames()).z_m.astype(float))
+    T_camera_board = plate.pose.T_camera_board
+    place_m = transform_points(T_camera_board, np.array([x_mm * MM, 0.0, 0.0]))
+    half_m = np.array([0.25, 0.15])
+    part = PartFace(T_camera_board, -half_m, half_m)
+    board = tangent_board(plate, hole, part, place_m, FACING)
+    implant = implant_of(
+        config,
+        same,
+        lens,
+        board,
+        1,
+        3,
+        tmp_path,
+    )
+    change_m = (z_m[0] - z_m[1])[implant.region.within(unit.region)]
+    assert implant.depth_mm * MM == pytest.approx(np.nanmax(change_m), rel=0.03)
+    assert implant.shift_m.sum() == pytest.approx(np.nansum(change_m), rel=0.03)

@@ -378,10 +378,9 @@ def _shares(options: argparse.Namespace, recordings: str, peaks_mm: list[float])
             f"Measured: {recordings}, with their surface, noise, fixed pattern, texture and "
             "missing returns."
         ),
-        f"Simulated: the damage, by the model of {options.camera}, on the tangent plane at "
-        "its place, with an albedo "
-        f"of {options.albedo:g}; noise is added where the damage weakens the light, but "
-        "never removed.",
+        f"Simulated: the damage, by the model of {options.camera}, in a flat board as large as "
+        f"the part on the tangent plane at its place, with an albedo of {options.albedo:g}; noise "
+        "is added where the damage weakens the light, but never removed.",
         f"Virtual damage shows a median depth of {middle:.2g} mm ({low:.2g} to {high:.2g} "
         "mm for eight in ten). If "
         "real damage of such sizes shows more or less depth in recordings of this camera, "

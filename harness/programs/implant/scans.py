@@ -17,6 +17,7 @@ import pandas as pd
 from scipy import ndimage
 
 from detectors.averages.average import RECORDED, average
+from detectors.crop import AutoCrop, choice_of
 from detectors.pixels.noise import REACH_FRAMES, noise_reach_px, sides_if_upsampled
 from detectors.recordings import Recording
 from harness.evaluation.study.record import SetUpRecord
@@ -30,7 +31,15 @@ from harness.trials.record import add_judgement
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
 from harness.vocabulary.seeds import digest, random_stream
-from scenes.implants import BEYOND_PX, KINDS, Implant, implant_of, local_board, side_mm, unit_config
+from scenes.implants import (
+    BEYOND_PX,
+    KINDS,
+    Implant,
+    PartFace,
+    implant_of,
+    tangent_board,
+    unit_config,
+)
 from scenes.sensor.camera import camera_of
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig, Purpose
@@ -43,6 +52,7 @@ MOST_EMPTY = 200  # give up after this many placements in a row without a place 
 NORMAL_PX = 4  # half the side of the square of surface that determines the tangent plane
 # a warning follows if the judged rim is steeper than the places of damage by this angle
 TELLING_DEG = 5.0
+OUTLIERS = 0.002  # share of a surface's points on either side that say nothing about its extent
 VARIANT = "main"
 
 
@@ -119,6 +129,26 @@ class Scan:
             self.judged[..., None],
             transform_points(invert(self.T_camera_board), met)[..., :2],
             np.nan,
+        )
+
+    @cached_property
+    def part(self) -> PartFace:
+        """The part as far as the recording shows it: the judged area, and the smooth surface of
+        which it is a piece. What a crop leaves out shades the damage, too."""
+        shown = self.judged
+        candidates = choice_of(self.whole, AutoCrop()).candidates
+        if candidates:
+            widest = max(candidates, key=lambda candidate: int((candidate.own & shown).sum()))
+            if (widest.own & shown).any():
+                shown = shown | widest.own
+        points_m = self.whole.points_m[shown & self.whole.valid]
+        places_m = transform_points(invert(self.T_camera_board), points_m)[:, :2]
+        low_m, high_m = np.quantile(places_m, (OUTLIERS, 1 - OUTLIERS), axis=0)
+        judged_m = self.size_m / 2
+        return PartFace(
+            T_camera_part=self.T_camera_board,
+            low_m=np.minimum(low_m, -judged_m),
+            high_m=np.maximum(high_m, judged_m),
         )
 
     @cached_property
@@ -279,7 +309,7 @@ def placements(
         for damage in placed.damages:
             spot = scan.place(*damage.centre_m, 0.0)
             assert spot is not None  # `damages_placed` has checked it
-            board = local_board(placed, damage, *spot, side_mm(damage, float(spot[0][2]), config))
+            board = tangent_board(placed, damage, scan.part, *spot)
             draw = int(random_stream(seed, "implant", number, damage.id).integers(2**31))
             implants.append(
                 implant_of(config, same, scan.lens, board, len(scan.frames), draw, cache)

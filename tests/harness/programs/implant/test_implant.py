@@ -19,7 +19,7 @@ from harness.programs.implant import implant
 from harness.programs.implant.scans import Judging, Scan, damages_placed
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
 from scenes.closed_form import plane_view
-from scenes.implants import Implant, implant_of, local_board, side_mm, unit_config
+from scenes.implants import Implant, PartFace, implant_of, tangent_board, unit_config
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import camera_of
@@ -88,7 +88,8 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     position = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)
     (one,) = target.damages
-    alone = local_board(target, one, position, T[:3, 2], side_mm(one, 0.7, config))
+    part = PartFace(T, np.full(2, -50.0 * MM), np.full(2, 50.0 * MM))
+    alone = tangent_board(target, one, part, position, T[:3, 2])
     implant = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
     assert same
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)

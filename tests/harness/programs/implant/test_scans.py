@@ -95,6 +95,19 @@ def test_places_lie_on_the_rays_of_their_pixels(scan: Scan) -> None:
     assert scan.pitch_m == pytest.approx(np.sqrt(scan.area_m2 / 3000))
 
 
+def test_the_part_is_larger_than_what_is_judged_of_it(scan: Scan) -> None:
+    """The wall fills the picture, of which 50 x 60 of 60 x 80 pixels are judged."""
+    corners = np.array([(0, 0), (0, 79), (59, 0), (59, 79)])
+    wall = wall_m()[tuple(corners.T)]
+    places = (wall - scan.T_camera_board[:3, 3]) @ scan.T_camera_board[:3, :2]
+    widths = places[[1, 3], 0] - places[[0, 2], 0]
+    extent = scan.part.high_m - scan.part.low_m
+    assert widths.min() * 0.95 < extent[0] < widths.max()
+    assert extent[0] > 1.2 * scan.size_m[0]
+    assert scan.part.low_m[0] < -scan.size_m[0] / 2
+    assert scan.part.T_camera_part is scan.T_camera_board
+
+
 def test_angles_and_distances_from_the_rim(scan: Scan) -> None:
     directions = rays() / np.linalg.norm(rays(), axis=-1, keepdims=True)
     angle_deg = np.degrees(np.arccos(-(directions @ WALL.normal)))
