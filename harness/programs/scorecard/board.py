@@ -170,7 +170,7 @@ def measured(
         )
     flat = np.concatenate(noises, axis=1)[:, None]
     in_view = np.isfinite(peaks)
-    angles = _angles_deg(target)
+    angles = angles_deg(target)
     noise = jackknifed(flat, lambda z: temporal_sigma_m(z) / MM)
     readings: Readings = {("temporal deviation", "on the face", "mm"): (noise, flat.shape[2])}
     for size, parts in patterns.items():
@@ -224,7 +224,7 @@ def _residual_mm(plan_mm: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.nda
     return (z - basis @ surface) / MM, ring
 
 
-def _angles_deg(target: TargetConfig) -> np.ndarray:
+def angles_deg(target: TargetConfig) -> np.ndarray:
     """Return the angle (n,) of each hole from the depth camera's axis."""
     on_board_m = np.array([[*hole.centre_m, 0.0] for hole in target.holes])
     centres_m = transform_points(target.pose.T_camera_board, on_board_m)
@@ -379,7 +379,7 @@ def _draw(
         look: dict[str, Any] = {"s": 10, "c": COLOURS[number % len(COLOURS)], "marker": "o"}
         if label == "capture":
             look = {"s": 60, "c": "black", "marker": "+"}
-        axes.scatter(_angles_deg(target), peaks_mm, label=label, **look)
+        axes.scatter(angles_deg(target), peaks_mm, label=label, **look)
     axes.set_xlabel("angle from the depth camera's axis / degrees")
     axes.set_ylabel("peak behind the face / mm")
     axes.legend(fontsize=7)

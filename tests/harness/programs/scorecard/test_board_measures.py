@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from harness.programs.scorecard import board
 from harness.programs.scorecard.board import (
     Image,
-    _angles_deg,
     _answer,
     _cloud,
     _cut_around,
     _residual_mm,
+    angles_deg,
     image_of,
     measured,
 )
@@ -173,7 +173,7 @@ def test_the_angle_of_a_hole_is_that_from_the_axis() -> None:
     T = np.eye(4)
     T[:3, 3] = [0.0, 0.0, 0.5]
     target = target_of((0.0, 0.0), (300.0, 400.0), (-500.0, 0.0), T_camera_board=T)
-    assert _angles_deg(target) == pytest.approx([0.0, 45.0, 45.0])
+    assert angles_deg(target) == pytest.approx([0.0, 45.0, 45.0])
 
 
 def test_the_average_of_frames_by_hand() -> None:
