@@ -17,7 +17,10 @@ import numpy as np
 
 from detectors.methods.network import HALF, INPUTS, RINGS, Layer, Network, columns_of, ring_sums
 
-RATE = 2e-3  # largest step of a weight, in units of its gradient's own size
+RATE = 6e-3
+"""Largest step of a weight, in units of its gradient's own size. After 120 steps on 24 pictures the
+loss on 12 others was .0111, .0081 and .0130 with .002, .008 and .020."""
+FIRST_ODDS = 0.1  # factor of the last layer's first weights, so that training begins at the prior
 WARM_UP = 0.05  # share of the steps over which the rate rises
 MEAN_KEPT = 0.9  # share of the mean gradient that a step keeps
 SQUARE_KEPT = 0.999  # the same for its mean square
@@ -53,6 +56,8 @@ def new_network(
         is_last = number == len(dilations_px) - 1
         outputs = 1 if is_last else channels
         deviation = math.sqrt(2.0 / (inputs * RINGS))
+        if is_last:
+            deviation *= FIRST_ODDS
         weights = stream.standard_normal((outputs, inputs, RINGS)) * deviation
         bias = np.full(outputs, prior_log_odds if is_last else 0.0)
         layers.append(Layer(weights.astype(np.float32), bias.astype(np.float32), dilation_px))
