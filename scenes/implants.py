@@ -173,13 +173,8 @@ def implant_of(
     more) of a recording with this lens. ``config``, ``same``: those of `unit_config`. Raises
     UserError if the damage is out of the camera's view."""
     camera = camera_of(config)
-<<<<<<< HEAD
-    surroundings = _surroundings(camera, board)
-    region = surroundings.region(camera.nominal_lens)
-=======
     reached = _reached_disc(camera, board)
     region = reached.region(camera.nominal_lens)
->>>>>>> implants
     damaged = board.at_wavelength(camera.optics.wavelength_nm)
     drawn_m, smooth_m = _drawn(config, damaged, region, frames, seed, cache)
     drawn_whole_m, smooth_whole_m = _drawn(config, damaged.hole_free(), region, frames, seed, cache)
@@ -194,22 +189,14 @@ def implant_of(
         ratio = np.nanvar(drawn_whole_m, axis=0) / np.nanvar(drawn_m, axis=0)
         added_share = np.sqrt(np.clip(1.0 - ratio, 0.0, 1.0))
         added_noise_m = added_share * (drawn_m - mean_m)
-<<<<<<< HEAD
-    near_damage = surroundings.holds(camera.nominal_lens.region_slopes(region))
-=======
     near_damage = reached.holds(camera.nominal_lens.region_slopes(region))
->>>>>>> implants
     shift_m = np.where(near_damage, np.nan_to_num(middle_m - middle_whole_m), 0.0)
     noise_m = np.where(near_damage, np.nan_to_num(added_noise_m), 0.0)
     lost = near_damage & np.isnan(drawn_m) & np.isfinite(drawn_whole_m)
     if same:
         return Implant(region, shift_m, noise_m, lost)
     # the recording is aligned to other pixels: interpolate between the camera's pixels
-<<<<<<< HEAD
-    onto = surroundings.region(lens)
-=======
     onto = reached.region(lens)
->>>>>>> implants
     rays = np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1)
     pixels = camera.nominal_lens.project(rays)
     rows_columns = [pixels[..., 1] - region.row0, pixels[..., 0] - region.col0]
@@ -247,11 +234,7 @@ def _drawn(
 
 
 @dataclass(frozen=True, eq=False)
-<<<<<<< HEAD
-class _Surroundings:
-=======
 class _ReachedDisc:
->>>>>>> implants
     """The part of a board's face that its damage may change through the camera's filter: a
     disc."""
 
@@ -287,24 +270,15 @@ class _ReachedDisc:
         return np.asarray(apart_m < self.radius_m)
 
 
-<<<<<<< HEAD
-def _surroundings(camera: AnyCamera, board: custom.TargetConfig) -> _Surroundings:
-    """Return the surroundings of the only damage of a flat board."""
-=======
 def _reached_disc(camera: AnyCamera, board: custom.TargetConfig) -> _ReachedDisc:
     """Return what the only damage of a flat board may change."""
->>>>>>> implants
     (damage,) = board.damages
     T_camera_board = board.pose.T_camera_board
     centre_m = transform_points(T_camera_board, np.array([*damage.centre_m, 0.0]))
     lens = camera.nominal_lens
     pitch_m = float(centre_m[2]) / min(lens.fx, lens.fy)
     reach_px = camera.optics.margin_px + BEYOND_PX
-<<<<<<< HEAD
-    return _Surroundings(
-=======
     return _ReachedDisc(
->>>>>>> implants
         centre_m=centre_m,
         axes=T_camera_board[:3, :3],
         radius_m=damage.reach_mm * MM + reach_px * pitch_m,
