@@ -31,6 +31,11 @@ PROGRAMS = (
         "which camera finds a damage, at which distance, with how many frames, by stored limits",
     ),
     ProgramEntry(
+        "audit",
+        "harness.programs.audit.audit",
+        "how often everything that is quoted covers the truth",
+    ),
+    ProgramEntry(
         "characterise",
         "harness.programs.camera.characterise",
         "measures your own camera on static captures, as a page and a camera file",

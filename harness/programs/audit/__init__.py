@@ -1,0 +1,1 @@
+"""Audit: how often everything that is quoted covers the truth."""
