@@ -141,15 +141,18 @@ def inverse_times(
     by: Filters,
     start: np.ndarray | None = None,
     error: float = CONVERGED,
+    added: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C.
+    """Return C^-1 r (r, c) over the known pixels, 0 elsewhere, for the `filters` of C, to whose
+    diagonal the variances ``added`` (r, c) are added.
 
     Preconditioned conjugate gradients go on from ``start`` (r, c) until scores near unknown
     pixels, where errors gather, err by some ``error`` deviations. The preconditioner fills unknown
     pixels from their neighbours, applies the stationary inverse, and then the transpose of the
     filling: with zeros instead, ragged outlines and missing pixels take up to four times the
     steps. It would still be too large along outlines: damping it the more, the less is known
-    around a pixel, saves a fifth of the steps."""
+    around a pixel, saves a fifth of the steps. What is added makes the problem easier, and is left
+    out of the preconditioner."""
     height, width = values.shape
     mask = known.astype(np.float32)
     padded = np.zeros_like(by.power)
@@ -179,6 +182,8 @@ def inverse_times(
         padded[:height, :width] = image
         product = _filtered(padded, by.power, padded_product)
         np.multiply(product[:height, :width], mask, out=covariance_times)
+        if added is not None:
+            np.add(covariance_times, added * image, out=covariance_times)
 
     def condition(image: np.ndarray) -> None:
         """Write the approximate C^-1 times an image into ``conditioned``."""
@@ -225,6 +230,14 @@ def root_times(values: np.ndarray, by: Filters) -> np.ndarray:
     # the factors contain the size of the grid once, as the inverse transform needs it
     root = np.sqrt(by.power / np.float32(by.power.size))
     return _filtered(padded, root, padded)[:height, :width].copy()
+
+
+def covariance_product(values: np.ndarray, by: Filters) -> np.ndarray:
+    """Return C times values (r, c) at all pixels (r, c), for the `filters` of C."""
+    height, width = values.shape
+    padded = np.zeros_like(by.power)
+    padded[:height, :width] = values
+    return _filtered(padded, by.power, padded)[:height, :width]
 
 
 def _filtered(

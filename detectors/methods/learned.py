@@ -73,8 +73,10 @@ class LearnedDetector(MatchedDetector):
         residual_m: np.ndarray,
         weights: np.ndarray,
         rounding_m2: tuple[float, float],
+        reach_px: float,
     ) -> tuple[np.ndarray, float, str]:
-        """Return signed scores (r, c), a pixel's deviation (m), and the unit of score."""
+        """Return signed scores (r, c), a pixel's deviation (m), and the unit of score. The network
+        sees the rim as it is: variances of its own are not taken off."""
         whitened = self.whitened(residual_m, weights, rounding_m2)
         network = self.network
         behind = _score(network, seen_by_network(whitened.values, whitened.known, 1.0))

@@ -3,7 +3,8 @@ and its local noise.
 
 A pixel is judged by means over windows of several widths, each compared with the mean of its
 surroundings. One unit of score is the standard deviation of that difference as measured nearby, so
-that correlated noise, a fixed pattern and texture raise the threshold where they are. Findings are
+that correlated noise, a fixed pattern and texture raise the threshold where they are. Near the
+outline it includes the errors that an edge leaves there (`detectors.findings.rim`). Findings are
 peaks of the score.
 
 Not modelled: the noise's spectrum, damage narrower than a pixel or wider than the widest filter,
@@ -19,9 +20,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from detectors.crop import AutoCrop, CropConfig, crop
+from detectors.findings import whitening
 from detectors.findings.measure import HoleModelConfig, measure_detection
+from detectors.findings.rim import on_pixels, reach_of, rim_variances
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN, root_of
+from detectors.pixels.masks import outline_depth_px
 from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import Findings, above, on_grid
 from detectors.surfaces.background import Background
@@ -99,6 +103,8 @@ class LocalEvidence(Evidence):
     """(h, w): flat index of each point's cell, -1 where there is no score."""
     spread_m: np.ndarray = None  # type: ignore[assignment]
     """(h, w): standard deviation of the surface itself, metres."""
+    reach_px: float = 0.0
+    """Cells to which an edge of the target reaches inwards."""
 
 
 class LocalPicture(NamedTuple):
@@ -111,6 +117,8 @@ class LocalPicture(NamedTuple):
     residuals: tuple[np.ndarray, np.ndarray, tuple[float, float]]
     """Arguments of `LocalDetector.scored`: residuals (r, c), metres; their weights (r, c), 0 where
     nothing is known; and the variances that rounding leaves (`rounding_variances`)."""
+    reach_px: float
+    """Cells to which an edge of the target reaches inwards."""
 
 
 class LocalDetector:
@@ -149,13 +157,13 @@ class LocalDetector:
             cell=cell,
             shape=shape,
         )
-        return LocalPicture(ground, cell, residuals)
+        return LocalPicture(ground, cell, residuals, reach_of(cloud) / pixels)
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop. Raises UserError on an empty crop, or if no surface can
         be fitted."""
-        ground, cell, residuals = self.picture(cloud)
-        signed, typical_m, unit = self.scored(*residuals)
+        ground, cell, residuals, reach_px = self.picture(cloud)
+        signed, typical_m, unit = self.scored(*residuals, reach_px)
         judged = cell >= 0
         scores = on_grid(signed.ravel()[cell[judged]], judged)
         return LocalEvidence(
@@ -170,6 +178,7 @@ class LocalDetector:
             signed=signed,
             cell=cell,
             spread_m=ground.spread_m,
+            reach_px=reach_px,
         )
 
     def rescored(
@@ -188,7 +197,7 @@ class LocalDetector:
             cell=evidence.cell,
             shape=evidence.signed.shape,
         )
-        signed, typical_m, unit = self.scored(*residuals)
+        signed, typical_m, unit = self.scored(*residuals, evidence.reach_px)
         judged = evidence.cell >= 0
         scores = on_grid(signed.ravel()[evidence.cell[judged]], judged)
         return replace(
@@ -206,11 +215,12 @@ class LocalDetector:
         residual_m: np.ndarray,
         weights: np.ndarray,
         rounding_m2: tuple[float, float],
+        reach_px: float,
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c) of a picture of residuals with weights, 0 where nothing is
-        known; the deviation in metres of the narrowest filter at a typical point; and the meaning
-        of a unit of score, in words."""
-        signed, widths, typical_m = _scored(residual_m, weights, rounding_m2)
+        known, and edges that reach so far; the deviation in metres of the narrowest filter at a
+        typical point; and the meaning of a unit of score, in words."""
+        signed, widths, typical_m = _scored(residual_m, weights, rounding_m2, reach_px)
         unit = (
             f"the local noise of means over {widths[0]} to {widths[-1]} pixels,"
             f" {1e3 * typical_m:.3g} mm for the narrowest at a typical point"
@@ -367,10 +377,14 @@ def _scored(
     residual_m: np.ndarray,
     weights: np.ndarray,
     rounding_m2: tuple[float, float],
+    reach_px: float,
 ) -> tuple[np.ndarray, list[int], float]:
     """Return signed scores (r, c) of a picture of residuals (r, c) with ``weights`` (r, c), 0
-    where nothing is known; the filters' widths in pixels; and the deviation of the narrowest at a
-    typical point, metres.
+    where nothing is known, and edges that reach ``reach_px`` inwards; the filters' widths in
+    pixels; and the deviation of the narrowest at a typical point, metres.
+
+    The errors of an edge are alike along it, so that a filter's mean does not reduce their
+    variance.
 
     Filters are applied from the narrowest to the widest. A pixel that is sure in one filter, by a
     share from 0 to 1, is excluded from the wider means of other pixels; a strong pixel is excluded
@@ -386,6 +400,7 @@ def _scored(
     rest, sigma = _levelled(values, weights, HALF_WIDTHS[count + SURROUNDINGS - 1])
     clipped = np.clip(rest, -CLIP_SIGMAS * sigma, CLIP_SIGMAS * sigma)
     modest = np.clip(rest, -LEVEL_SIGMAS * sigma, LEVEL_SIGMAS * sigma)
+    rim = sigma**2 * _rim_variances(rest / sigma, seen, reach_px)
 
     best = np.zeros(seen.shape, np.float32)
     sure = np.zeros_like(best)
@@ -401,11 +416,13 @@ def _scored(
         window = max(WINDOW_WIDTHS * width // 2, LEAST_WINDOW)
         mean, covered = _mean(clipped, (1.0 - sure) * weights, half)
         worth = np.sqrt(_worth((1.0 - sure) * weights, covered, half))
+        rim_mean, _ = _mean(rim, weights, half)
         for _ in range(2):
             around, _ = _mean(modest, quiet * weights, wide)
             # scale differences to the noise of a whole window
             difference = (mean - around) * worth
             sigma = local_sigma(np.where(seen & (quiet > 0), difference, np.nan), window, floor)
+            sigma = np.hypot(sigma, worth * np.sqrt(rim_mean))
             score = np.where(seen, difference / sigma, 0.0)
             quiet = np.minimum(quiet, np.clip(STRONG - np.abs(score), 0.0, 1.0))
         typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
@@ -425,6 +442,20 @@ def _scored(
     is_stronger = strongest * np.sign(best) > np.abs(best)
     signed = np.where(is_stronger, best + sure * (strongest - best), best)
     return signed.astype(np.float64), [2 * half + 1 for half in HALF_WIDTHS[:count]], typical_m
+
+
+def _rim_variances(noise: np.ndarray, seen: np.ndarray, reach_px: float) -> np.ndarray:
+    """Return the variances (r, c) that the ``seen`` pixels (r, c) of the rim have beyond the noise
+    (r, c) of deviation 1."""
+    depth_px = outline_depth_px(seen) * seen
+    inner = depth_px > reach_px
+    loud = (np.abs(noise) > STRONG).astype(np.uint8)
+    quiet = inner & (cv2.dilate(loud, np.ones((5, 5), np.uint8)) == 0)
+    values = np.where(seen, noise, 0.0).astype(np.float32)
+    covariance = whitening.noise_covariance(values, quiet, whitening.grid_of(seen.shape))
+    by = whitening.filters(covariance, seen.shape)
+    variances = rim_variances(values, depth_px, by, reach_px, is_alone=True)
+    return on_pixels(variances, depth_px)
 
 
 def _filter_count(seen: np.ndarray) -> int:

@@ -8,11 +8,12 @@ residuals r of the known pixels under that covariance C:
     score = t' C^-1 r / sqrt(t' C^-1 t)
 
 C^-1 r is solved for by conjugate gradients, so missing pixels and borders add nothing and need no
-filling. The scores of each template are then divided by their own deviation, separately for each
-distance from the outline (`detectors.methods.scatter`). Wide templates have few independent
-positions, so their scores are raised (`detectors.findings.templates.Worth`). Slots are scored on
-every second pixel, and around each of their peaks the best of many others is looked for
-(`detectors.methods.slots`).
+filling. Pixels of the target's rim, where an edge leaves errors that are no noise, have variances
+of their own in C, by their distance from the outline (`detectors.findings.rim`). The scores of each
+template are then divided by their own deviation, separately for each distance from the outline
+(`detectors.methods.scatter`). Wide templates have few independent positions, so their scores are
+raised (`detectors.findings.templates.Worth`). Slots are scored on every second pixel, and around
+each of their peaks the best of many others is looked for (`detectors.methods.slots`).
 
 Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that
 no filter sees the shoulder of a neighbouring hole. What pixels along the target's outline share
@@ -38,12 +39,13 @@ import numpy as np
 
 from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
+from detectors.findings.rim import BLOCK_PX, on_pixels, rim_variances
 from detectors.interface import Evidence
 from detectors.methods import local, slots
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import FAINT, WIDE_PX, evened, tail_of, zones_of
 from detectors.pixels.clusters import PLAIN
-from detectors.pixels.masks import grown
+from detectors.pixels.masks import grown, outline_depth_px
 from detectors.pixels.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
@@ -103,10 +105,17 @@ class MatchedDetector(LocalDetector):
     name = "matched"
     version = 12
 
-    def __init__(self, settings: FilterConfig, covariance: np.ndarray | None = None) -> None:
-        """``covariance``: the noise's, in squared deviations, that `calibrate` has learned."""
+    def __init__(
+        self,
+        settings: FilterConfig,
+        covariance: np.ndarray | None = None,
+        rim: np.ndarray | None = None,
+    ) -> None:
+        """What `calibrate` has learned, in squared deviations: the noise's ``covariance``, and the
+        variances (n,) that the rim adds (`rim_variances`)."""
         super().__init__(settings)
         self._covariance = covariance
+        self._rim = rim
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop by its depth and by the missing pixels around: the
@@ -135,11 +144,18 @@ class MatchedDetector(LocalDetector):
         residual_m: np.ndarray,
         weights: np.ndarray,
         rounding_m2: tuple[float, float],
+        reach_px: float,
     ) -> tuple[np.ndarray, float, str]:
         """Return signed scores (r, c), the deviation of the narrowest template's depth (m), and
         the unit of score."""
         residuals = _in_deviations(residual_m, weights, rounding_m2)
-        signed, narrowest = _judged(residuals, self._covariance)
+        covariance = self._covariance
+        if covariance is None:
+            covariance = _covariance(residuals)
+        rim = self._rim
+        if rim is None:
+            rim = _rim(residuals, covariance, reach_px, is_alone=True)
+        signed, narrowest = _judged(residuals, covariance, rim)
         depth_m = narrowest * float(np.median(residuals.unit_m[residuals.known]))
         unit = (
             f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the"
@@ -165,19 +181,21 @@ class MatchedDetector(LocalDetector):
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the
-        local noise."""
-        covariances = []
-        for cloud in hole_free:
-            residual_m, weights, rounding_m2 = self.picture(cloud).residuals
-            covariances.append(_covariance(_in_deviations(residual_m, weights, rounding_m2)))
-        if not covariances:
+        local noise, and the mean variances that their rims add."""
+        pictures = [self.picture(cloud) for cloud in hole_free]
+        if not pictures:
             return {}
-        return {"covariance": np.mean(covariances, axis=0)}
+        residuals = [_in_deviations(*picture.residuals) for picture in pictures]
+        covariance = np.mean([_covariance(picture) for picture in residuals], axis=0)
+        reach_px = max(picture.reach_px for picture in pictures)
+        is_alone = len(residuals) == 1
+        rims = [_rim(one, covariance, reach_px, is_alone=is_alone) for one in residuals]
+        return {"covariance": covariance, "rim": np.mean(rims, axis=0)}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
-        """Return the detector that whitens with the learned covariance instead of the capture's
-        own."""
-        return type(self)(self.settings, learned.get("covariance"))
+        """Return the detector that whitens with the learned covariance and rim instead of the
+        capture's own."""
+        return type(self)(self.settings, learned.get("covariance"), learned.get("rim"))
 
 
 def _with_missing(cloud: Cloud, evidence: LocalEvidence) -> LocalEvidence:
@@ -233,7 +251,7 @@ def _in_deviations(
     size = median_of(np.abs(values[known][::step]))
     share = short_size / max(size, 1e-12)
     unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
-    depth_px = _depth_px(known)
+    depth_px = outline_depth_px(known)
     return _Residuals(
         _without_rim(values / unit_m, depth_px * known),
         known,
@@ -242,18 +260,12 @@ def _in_deviations(
     )
 
 
-def _depth_px(known: np.ndarray) -> np.ndarray:
-    """Return the distance (r, c) of each pixel to the outline of the known pixels, ignoring single
-    unknown pixels."""
-    padded = cv2.copyMakeBorder(known.astype(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    return np.ascontiguousarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
-
-
 def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the
     same distance from the outline, beyond what those next to the rim share: subtracting a mean
-    would leave a step there. Pixels whose ``depth_px`` (r, c) is 0 are unknown."""
+    would leave a step there. What is subtracted fades inwards, so that it ends without a step, on
+    which smooth noise would be found to be damaged. Pixels whose ``depth_px`` (r, c) is 0 are
+    unknown."""
     noise = noise.astype(np.float32)
     rows = -(-noise.shape[0] // LAYER_PX)
     columns = -(-noise.shape[1] // LAYER_PX)
@@ -294,12 +306,13 @@ def _subtract_layers(
     shared: np.ndarray,
 ) -> None:
     """Subtract from the rim's residuals what they share (r, c, `RIM_PX` + 1) in their square and
-    at their distance."""
+    at their distance: all of it next to the outline, the less, the farther in."""
     for i in range(noise.shape[0]):
         for j in range(noise.shape[1]):
             if 0 < depth_px[i, j] <= RIM_PX:
                 layer = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
-                noise[i, j] -= np.float32(shared[layer])
+                fading = 1.0 - (depth_px[i, j] - 1.0) / RIM_PX
+                noise[i, j] -= np.float32(fading * shared[layer])
 
 
 def _covariance(residuals: _Residuals) -> np.ndarray:
@@ -313,6 +326,20 @@ def _covariance(residuals: _Residuals) -> np.ndarray:
     return whitening.noise_covariance(residuals.values, quiet, grid)
 
 
+def _rim(
+    residuals: _Residuals,
+    covariance: np.ndarray,
+    reach_px: float,
+    *,
+    is_alone: bool,
+) -> np.ndarray:
+    """Return the variances (n,) that the rim, into which edges reach by ``reach_px``, adds to noise
+    of this covariance, by distance from the outline (`rim_variances`)."""
+    noise = whitening.filters(covariance, residuals.values.shape)
+    depth_px = residuals.depth_px * residuals.known
+    return rim_variances(residuals.values, depth_px, noise, reach_px, is_alone=is_alone)
+
+
 # --- two passes: strong findings, and the rest without them ---
 
 
@@ -320,6 +347,9 @@ class _Noise(NamedTuple):
     """The noise of a picture, and what it makes of the templates."""
 
     filters: whitening.Filters
+    rim: np.ndarray
+    """(r, c): variance of independent pixels whose means over `BLOCK_PX` vary as those at their
+    distance from the outline do beyond it."""
     window_px: int
     """Side of the camera's window that the noise indicates."""
     worths: tuple[templates.Worth, ...]
@@ -341,16 +371,19 @@ class _Scores(NamedTuple):
     """(t,): deviation of each template's scores."""
 
 
-def _judged(residuals: _Residuals, covariance: np.ndarray | None) -> tuple[np.ndarray, float]:
+def _judged(
+    residuals: _Residuals,
+    covariance: np.ndarray,
+    rim: np.ndarray,
+) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest
-    template's height."""
+    template's height. ``rim`` (n,): variances that the rim adds to the covariance."""
     known = residuals.known
-    if covariance is None:
-        covariance = _covariance(residuals)
     window_px = templates.window_of(covariance)
     power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
     noise = _Noise(
         whitening.filters(covariance, known.shape),
+        BLOCK_PX * on_pixels(rim, residuals.depth_px),
         window_px,
         templates.worths(power, window_px),
         slots.energies(power, window_px),
@@ -535,10 +568,10 @@ def _scored(
             first pass, which looks for them: at the centres of pixels, with deviations of 1.
         start: (r, c), an approximate C^-1 r."""
     error = ROUGH if strong is None else whitening.CONVERGED
-    solved = whitening.inverse_times(values, seen, noise.filters, start, error)
+    solved = whitening.inverse_times(values, seen, noise.filters, start, error, noise.rim)
     fine = _View(
         seen.astype(np.float32),
-        _depth_px(seen),
+        outline_depth_px(seen),
         templates.transformed(solved, noise.filters.power.shape),
     )
     coarse = _View(_halved(fine.seen), _halved(fine.depth_px), templates.halved(fine.spectrum))

@@ -96,6 +96,14 @@ def parts_with(
     return has_seed[labels]
 
 
+def outline_depth_px(known: np.ndarray) -> np.ndarray:
+    """Return the distance (h, w) of each pixel to the outline of the known pixels, ignoring single
+    unknown pixels."""
+    padded = cv2.copyMakeBorder(known.astype(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return np.ascontiguousarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
+
+
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each pixel's distance (h, w) to the mask, in pixels, and the flat index of the mask's
     nearest pixel."""

@@ -5,7 +5,7 @@ frames or more, if the camera's model supports it). Frames that jump are then le
 displacement, which is known exactly."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -63,7 +63,8 @@ def averages_of(
     """Return the averages of the first n frames of a capture for each n in ``counts``. Their
     distribution is that of `detectors.averages.average.prefix_averages`, which is used (and may
     raise) if ``exact`` or if averages cannot be drawn at once. Larger averages contain the frames
-    of smaller ones drawn in the same way. A ``flat_field`` is subtracted."""
+    of smaller ones drawn in the same way. A ``flat_field`` is subtracted. Clouds state how far the
+    camera's edges reach."""
     clouds: dict[int, Cloud] = {}
     large = sorted({n for n in counts if n >= FEWEST_FRAMES})
     if large and not exact and config.method == "mean":
@@ -71,6 +72,9 @@ def averages_of(
     remaining = [n for n in counts if n not in clouds]
     if remaining or not counts:
         clouds.update(prefix_averages(capture, remaining, config))
+    reach_px = float(capture.unit.camera.optics.margin_px)
+    for n, cloud in clouds.items():
+        clouds[n] = replace(cloud, edge_reach_px=reach_px)
     if flat_field is None:
         return clouds
     field = flat_field_of(capture.unit.config, flat_field, capture.seed)

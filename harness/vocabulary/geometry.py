@@ -306,7 +306,9 @@ class Cloud:
     stated, is the variance of each averaged z with its systematic parts. ``noise_reach_px`` is the
     side of the square over which noise is blurred; 0 means unknown. ``noise_sides_px`` (2, r, c)
     are the sides, along rows and along columns, of the rectangle in r x c equal parts of the grid;
-    None means that they are not known to differ."""
+    None means that they are not known to differ. ``edge_reach_px`` is how far the camera's beam and
+    filters mix what lies beyond an edge into the pixels inside, as its model states; 0 means
+    unknown."""
 
     points_m: np.ndarray
     reason: np.ndarray
@@ -325,6 +327,7 @@ class Cloud:
     map_views: MapViews | None = None
     noise_reach_px: float = 0.0
     noise_sides_px: np.ndarray | None = None
+    edge_reach_px: float = 0.0
 
     @cached_property
     def crops(self) -> dict[Any, Any]:

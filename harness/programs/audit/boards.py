@@ -9,6 +9,7 @@ from harness import api
 from harness.evaluation.intervals import poisson_rate
 from harness.evaluation.study.limit import SetUpLimit
 from harness.programs.audit.rows import Audited, audited
+from harness.vocabulary.text import many
 
 WITHIN = 2.0  # standard errors
 NOMINAL = 0.954  # share of normal errors within two standard errors
@@ -20,7 +21,7 @@ def rows_of_study(folder: Path) -> list[Audited]:
     rows: list[Audited] = []
     for keys, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
         variant, frames, kind = keys
-        case = f"{variant}, {kind}, {frames} frame{'s' if frames > 1 else ''}"
+        case = f"{variant}, {kind}, {many(int(str(frames)), 'frame')}"
         rows += _sizes(of_set_up, case)
     rows += _rates(api.limits(folder))
     return rows

@@ -19,6 +19,7 @@ from detectors.findings.whitening import (
     _spread,
     centred,
     correlated_products,
+    covariance_product,
     filters,
     grid_of,
     inverse_times,
@@ -116,8 +117,11 @@ def test_unknown_pixels_are_filled_as_by_the_reference(image_shape, grid_shape, 
     )
 
 
+@pytest.mark.parametrize("added", [None, np.linspace(0.0, 2.0, 26 * 30).reshape(26, 30)])
 @pytest.mark.parametrize("side", [3, 5])
-def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(side: int) -> None:
+def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(
+    side: int, added: np.ndarray | None
+) -> None:
     known = np.random.default_rng(6).random(SHAPE) > 0.1
     known[10:14, 8:12] = False
     by_lag = noise_covariance(
@@ -126,8 +130,13 @@ def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(side: in
         (128, 160),
     )
     values = np.where(known, blurred(1, SHAPE, side), np.float32(0.0))
-    solved = inverse_times(values, known, filters(by_lag, SHAPE), error=0.01)
+    solved = inverse_times(values, known, filters(by_lag, SHAPE), error=0.01, added=added)
     dense = dense_of(known, by_lag, grid_of(SHAPE))
+    if added is not None:
+        dense += np.diag(added[known])
+    else:
+        product = covariance_product(solved, filters(by_lag, SHAPE))
+        np.testing.assert_allclose(product[known], values[known], atol=0.05)
     expected = np.linalg.solve(dense, values[known])
     np.testing.assert_allclose(
         solved[known],

@@ -230,7 +230,7 @@ def test_the_least_unit_is_what_rounding_leaves_in_a_mean() -> None:
     flat_m = np.zeros((80, 90))
     weights = np.ones(flat_m.shape, np.float32)
     for fixed_m2, random_m2, expected_m in ((4e-6, 0.0, 2e-3), (0.0, 4e-6, 2e-3 * 2 / 9)):
-        _, _, typical_m = _scored(flat_m, weights, (fixed_m2, random_m2))
+        _, _, typical_m = _scored(flat_m, weights, (fixed_m2, random_m2), 6.0)
         assert typical_m == pytest.approx(expected_m, rel=1e-5)
 
 

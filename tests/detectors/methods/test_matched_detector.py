@@ -23,7 +23,7 @@ from detectors.findings.whitening import (
     LONGEST_LAG_PX,
     grid_of,
 )
-from detectors.interface import Detection
+from detectors.interface import Detection, Evidence
 from detectors.methods.local import LocalDetector
 from detectors.methods.matched import (
     CLIP_SIGMAS,
@@ -37,7 +37,7 @@ from detectors.methods.matched import (
     _tamed,
     _without_rim,
 )
-from detectors.pixels.masks import grown
+from detectors.pixels.masks import grown, outline_depth_px
 from harness.testing.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
 
@@ -263,15 +263,68 @@ def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
         depth_px[:, distance - 1] = distance
     shared = np.zeros_like(noise)
     shared[:, 0] = 1.5
-    shared[:, 2] = -1.0
+    shared[:, 3] = -1.2
     result = _without_rim(noise + shared, depth_px)
     remainder = result.mean(axis=0)
+    # half of what the fourth of six pixels share is left
+    remainder[3] += 0.6
     # what those next to the rim share too stays
     level = _without_rim(noise + shared + np.float32(0.8), depth_px).mean(axis=0)
+    level[3] += 0.6
     np.testing.assert_allclose(level[:RIM_PX], 0.8, atol=0.5)
     # 100 pixels, of which some 65 count at each
     assert np.abs(remainder[:RIM_PX]).max() < 0.35
     np.testing.assert_array_equal(result[:, RIM_PX:], noise[:, RIM_PX:])
+
+
+def stepped(seed: int) -> np.ndarray:
+    """Errors of an edge on the outermost three pixels, alike over nine pixels along it, as where
+    an edge crosses the rows of pixels at a small angle."""
+    rows, columns = np.indices(SHAPE)
+    runs = (
+        np.random.default_rng(seed).uniform(-1.0, 1.0, (4, max(SHAPE) // 9 + 1)).repeat(9, axis=1)
+    )
+    depths = (rows, SHAPE[0] - 1 - rows, columns, SHAPE[1] - 1 - columns)
+    along = (columns, columns, rows, rows)
+    errors = np.zeros(SHAPE)
+    for depth, place, run in zip(depths, along, runs, strict=True):
+        errors += np.select([depth == 0, depth == 1, depth == 2], [2.0, 0.8, 0.3], 0.0) * run[place]
+    return errors
+
+
+def smooth(seed: int) -> np.ndarray:
+    """Noise of deviation 1 with Gaussian weights of 3 pixels, as a scanned lidar's."""
+    white = np.random.default_rng(seed).standard_normal(SHAPE)
+    noise = cv2.GaussianBlur(white, (0, 0), 3.0)
+    return np.asarray(noise / noise.std())
+
+
+def rim_peak(evidence: Evidence) -> float:
+    """The highest score of the outermost six pixels."""
+    return float(evidence.score[outline_depth_px(np.ones(SHAPE, bool)) <= RIM_PX].max())
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_the_errors_of_an_edge_are_no_damage(learns: bool) -> None:
+    """The same noise with and without them: the rim's highest score grows by a deviation at most;
+    if they count as noise of the inside, by two and more. A hole at the rim is found beside them.
+    """
+    clouds = [cloud_of(3e-4 * (smooth(seed) + stepped(seed))) for seed in range(30, 38)]
+    detector = DETECTOR
+    if learns:
+        learned = DETECTOR.calibrate(clouds[4:])
+        assert learned["rim"].shape == (6,)
+        detector = DETECTOR.calibrated(learned)
+    unaware = DETECTOR.calibrated({**DETECTOR.calibrate(clouds[4:]), "rim": np.zeros(6)})
+    plain = [rim_peak(detector.analyse(cloud_of(3e-4 * smooth(seed)))) for seed in range(30, 34)]
+    aware = [rim_peak(detector.analyse(cloud)) for cloud in clouds[:4]]
+    misled = [rim_peak(unaware.analyse(cloud)) for cloud in clouds[:4]]
+    assert np.mean(aware) < np.mean(plain) + 1.0
+    assert np.mean(misled) > np.mean(plain) + 2.0
+    deep = hole(5, 45, 3.0, 0.004) + 3e-4 * (smooth(30) + stepped(30))
+    found = detector.find(cloud_of(deep), detector.analyse(cloud_of(deep)), 6.0)
+    places = [np.unravel_index(detection.pixels[0], SHAPE) for detection in found]
+    assert any(np.hypot(row - 45, column - 5) < 8.0 for row, column in places)
 
 
 def test_wide_templates_fill_their_discs() -> None:

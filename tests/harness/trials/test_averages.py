@@ -18,6 +18,7 @@ REGION = Region(0, 1, 0, 4)
 STEP_M = 1e-3
 NOISE_M = 2e-3
 ERRORS_M = np.zeros(40)
+REACH_PX = 4
 
 
 class WrittenCapture:
@@ -33,7 +34,8 @@ class WrittenCapture:
 
     def __init__(self, *, noise_m: float = NOISE_M, sure_pixels: int = 8192) -> None:
         summer = SimpleNamespace(noise_m=noise_m, sure_pixels=sure_pixels, z_by_error=2.0)
-        self.unit = SimpleNamespace(at_once=summer, rgb=None)
+        camera = SimpleNamespace(optics=SimpleNamespace(margin_px=REACH_PX))
+        self.unit = SimpleNamespace(at_once=summer, rgb=None, camera=camera)
         self.errors_m = ERRORS_M.copy()
         self.slopes = np.zeros((1, 4, 2))
         self.slopes[0, 0] = 0.5, -0.25
@@ -146,9 +148,9 @@ def test_few_frames_medians_and_exact_averages_are_drawn_singly(
 ) -> None:
     singly: list[list[int]] = []
 
-    def one_by_one(capture: object, counts: list[int], config: object) -> dict[int, str]:
+    def one_by_one(capture: Any, counts: list[int], config: object) -> dict[int, Any]:
         singly.append(list(counts))
-        return dict.fromkeys(counts, "drawn singly")
+        return {n: averages._cloud(capture, capture.sums(n), ()) for n in counts}
 
     monkeypatch.setattr(averages, "prefix_averages", one_by_one)
     mean = AverageConfig(judge_frames=False)
@@ -157,6 +159,7 @@ def test_few_frames_medians_and_exact_averages_are_drawn_singly(
     assert singly.pop() == [1, FEWEST_FRAMES - 1]
     assert sorted(clouds) == [1, FEWEST_FRAMES - 1, FEWEST_FRAMES, 30]
     assert clouds[30].n_frames == 30
+    assert {cloud.edge_reach_px for cloud in clouds.values()} == {REACH_PX}
     averages_of(capture, [FEWEST_FRAMES], mean, exact=False)
     assert singly == []
     averages_of(capture, [20], mean, exact=True)
