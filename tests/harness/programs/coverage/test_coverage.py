@@ -32,6 +32,7 @@ from harness.runs.plan import batch_of, plan_of
 from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import UserError
 
+ONE_DETECTOR = "sweep.detector.name=[thesis]"
 THRESHOLD = 5.0
 SCATTER = 0.15
 
@@ -172,11 +173,11 @@ def test_the_program_says_where_the_camera_is_blind(
     [
         (["plate", "--set", "sweep={}"], "is not a study of drawn damage"),
         (["detection_limit", "--size", "5mm"], "set-ups, but only --goal can compare several"),
-        (["pipe", "--size", "5"], "not a length with a unit"),
+        (["pipe", "--set", ONE_DETECTOR, "--size", "5"], "not a length with a unit"),
         (["pipe", "--goal", "5mm", "--suggest", "2"], "leave out --size"),
-        (["pipe", "--size", "99mm"], "inspects no damage of that size"),
+        (["pipe", "--set", ONE_DETECTOR, "--size", "99mm"], "inspects no damage of that size"),
         (["pipe", "--goal", "99mm"], "inspects no damage of that size"),
-        (["pipe", "--share", "2"], "a share above 0"),
+        (["pipe", "--set", ONE_DETECTOR, "--share", "2"], "a share above 0"),
     ],
 )
 def test_mistakes_are_one_message(
@@ -199,7 +200,7 @@ PLACES_MM = (
 def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[int, int], float]:
     """Return a90 at each place, by hits of the experiment's own damage there, on boards in its own
     random poses."""
-    (group,) = plan_of(load_experiment(Path("pipe")), cache).groups
+    (group,) = plan_of(load_experiment(Path("pipe"), [ONE_DETECTOR]), cache).groups
     source = group.points[0].config.simulated
     task = survey.task
     hits: dict[tuple[int, int], list[tuple[float, bool, int]]] = {}
@@ -238,7 +239,7 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
 
 @pytest.mark.slow
 def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
-    experiment = load_experiment(Path("pipe"))
+    experiment = load_experiment(Path("pipe"), [ONE_DETECTOR])
     cache = tmp_path / "renders"
     with engine_of(EngineOptions(jobs=2)) as local:
         (survey,) = engine.survey(experiment, [(0.7, 0.0, 0.0)], cache, tmp_path, local)
