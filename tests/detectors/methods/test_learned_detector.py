@@ -135,6 +135,13 @@ def test_a_missing_network_is_one_problem_of_the_settings(tmp_path):
         detector_of(tmp_path / "none.npz")
 
 
+def test_a_network_of_another_shape_is_one_problem_of_the_settings(tmp_path):
+    odd = Layer(np.zeros((1, 5, 3), np.float32), np.zeros(1, np.float32), 1)
+    write_network(tmp_path / "odd.npz", Network((odd,), PRIOR))
+    with pytest.raises(UserError, match=r"layer 0 has weights \(1, 5, 3\)"):
+        detector_of(tmp_path / "odd.npz")
+
+
 def test_it_keeps_the_contract() -> None:
     check_detector(LearnedDetector, settings={"crop": {"kind": "none"}})
 
