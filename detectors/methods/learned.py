@@ -58,7 +58,12 @@ class LearnedConfig(MatchedConfig):
         path = SHIPPED if name is None else Path(str(name))
         if not path.is_file():
             raise ValueError(f"network: there is no file {path}; write one with tofpod train")
-        return {**data, "digest": file_digest(path)}
+        digest = file_digest(path)
+        try:
+            _read(path, digest)
+        except UserError as error:
+            raise ValueError(f"network: {error}") from error
+        return {**data, "digest": digest}
 
 
 class LearnedDetector(MatchedDetector):

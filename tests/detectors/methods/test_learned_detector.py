@@ -13,6 +13,7 @@ import pytest
 from detectors import load_detector
 from detectors.methods.learned import SHIPPED, LearnedConfig, LearnedDetector, seen_by_network
 from detectors.methods.network import Layer, Network, read_network, write_network
+from harness.testing import check_detector
 from harness.testing.synthetic_clouds import plane
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud
@@ -132,6 +133,17 @@ def test_the_network_of_another_content_is_refused(tmp_path):
 def test_a_missing_network_is_one_problem_of_the_settings(tmp_path):
     with pytest.raises(UserError, match=r"there is no file .*none\.npz; write one with tofpod"):
         detector_of(tmp_path / "none.npz")
+
+
+def test_a_network_of_another_shape_is_one_problem_of_the_settings(tmp_path):
+    odd = Layer(np.zeros((1, 5, 3), np.float32), np.zeros(1, np.float32), 1)
+    write_network(tmp_path / "odd.npz", Network((odd,), PRIOR))
+    with pytest.raises(UserError, match=r"layer 0 has weights \(1, 5, 3\)"):
+        detector_of(tmp_path / "odd.npz")
+
+
+def test_it_keeps_the_contract() -> None:
+    check_detector(LearnedDetector, settings={"crop": {"kind": "none"}})
 
 
 def test_the_shipped_network_says_what_it_was_trained_on():
