@@ -281,15 +281,14 @@ class Score:
 
     @property
     def grade(self) -> int:
-        """The narrowest band that holds a value: 3 the source's own tolerance, 2 `NEAR`, 0 none; 1
-        for a bound that holds."""
+        """The number of bands that hold a value: that in which it passes, that of the source's own
+        tolerance, and that of `NEAR`. 1 for a bound that holds."""
         published = self.figure.published
-        if not self.passes or published.value is None:
+        if published.value is None:
             return int(self.passes)
-        own_low, own_high = published.limits(0.0, published.tolerance or 0.0)
-        if own_low <= self.simulated.value <= own_high:
-            return 3
-        return 2
+        low, high = published.limits(0.0, published.tolerance or 0.0)
+        is_within_own = low <= self.simulated.value <= high
+        return int(self.passes) + int(is_within_own) + int(bool(self.strict))
 
     @property
     def fell_behind(self) -> bool:

@@ -111,6 +111,15 @@ class PatchConditions(PlaneConditions):
     ] = 0.0
 
 
+class RangesConditions(Config):
+    """A nearly frontal matte plane at several distances; ambient light is as in `CameraConfig`."""
+
+    distances_m: Annotated[
+        tuple[Distance, ...], Field(min_length=4, description="four or more, in metres")
+    ] = (1.0, 1.5, 2.0, 2.5)
+    albedo: Albedo = 0.8
+
+
 class NearConditions(Config):
     """A nearly frontal matte plane that comes nearer; ambient light is as in `CameraConfig`."""
 
@@ -155,6 +164,7 @@ class StepConditions(Config):
 
 _WORDS: dict[str, Callable[[Any], str]] = {
     "distance_m": "{:g} m".format,
+    "distances_m": lambda v: f"{min(v):g} to {max(v):g} m",
     "albedo": "albedo {:g}".format,
     "angle_deg": lambda v: f"{v:g}°" if v else "",
     "ambient_uw_cm2_nm": lambda v: "" if v == ROOM_LIGHT else f"ambient {v:g} µW/(cm² nm)",
@@ -441,6 +451,17 @@ def systematic_error_mm(bench: Bench, c: PlaneConditions) -> Reading:
         error_m = (stack.z_m - stack.true_z_m)[np.isfinite(stack.z_m)]
         errors.append(abs(error_m.mean()) / MM if error_m.size else np.nan)
     return Reading(float(np.fmax.reduce(errors)))
+
+
+@_quantity("error over range", RangesConditions, STEADY)
+def error_over_range_mm(bench: Bench, c: RangesConditions) -> Reading:
+    """Standard deviation over distances of a unit's mean error of z over pixels and frames."""
+    errors_mm = []
+    for distance_m in c.distances_m:
+        plane = PlaneConditions(distance_m=distance_m, albedo=c.albedo)
+        stack = plane_stack(bench, plane, STEADY)
+        errors_mm.append(float(np.nanmean(stack.z_m - stack.true_z_m)) / MM)
+    return Reading(float(np.std(errors_mm, ddof=1)))
 
 
 @_quantity("fixed pattern", PlaneConditions, PATTERNED)

@@ -93,6 +93,23 @@ def test_the_systematic_error_is_the_largest_of_the_units(
     assert units == [(1, 3), (2, 3), (3, 3)]
 
 
+def test_the_error_over_range_leaves_out_what_all_ranges_share(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Errors of 11, 12, 14 and 15 mm: squares of 4, 1, 1 and 4 about 13, over three. Missing
+    pixels do not count."""
+    errors_mm = {1.0: 11.0, 2.0: 12.0, 3.0: 14.0, 4.0: 15.0}
+
+    def frames_of(bench: Any, c: PlaneConditions, effects: Any) -> FrameStack:
+        z_m = np.full((3, 10, 10), c.distance_m + errors_mm[c.distance_m] * MM)
+        z_m[0, 0, 0] = np.nan
+        return stack_of(z_m, c.distance_m)
+
+    monkeypatch.setattr(quantities, "plane_stack", frames_of)
+    deviation_mm = value("error_over_range_mm", distances_m=[1.0, 2.0, 3.0, 4.0])
+    assert deviation_mm == pytest.approx(np.sqrt(10 / 3))
+
+
 def test_the_deviation_of_single_pixels(units: list[tuple[int, int | None]]) -> None:
     assert value("temporal_sigma_mm") == pytest.approx(2.0, rel=0.02)
     assert value("random_error_mm") == pytest.approx(2.0, rel=0.02)

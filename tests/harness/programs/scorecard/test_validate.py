@@ -366,7 +366,7 @@ def test_strict_is_within_25_percent_whatever_the_tolerance(tmp_path):
         False,
     ]
     assert Score(bound, Reading(0.7)).strict is None
-    assert [Score(wide, Reading(x)).grade for x in (0.31, 0.29)] == [3, 0]
+    assert [Score(wide, Reading(x)).grade for x in (0.4, 0.31, 0.29)] == [3, 2, 0]
     narrow = GOOD.replace("{above: 0.5}", "{value: 0.5, tolerance: 0.05}", 1)
     _, narrow_figure = read_figures(written(tmp_path, narrow)).figures
     assert [Score(narrow_figure, Reading(x)).grade for x in (0.54, 0.56, 0.63)] == [3, 2, 0]
