@@ -515,7 +515,10 @@ def _lens_sides(
     if cloud.noise_reach_px:
         return 1.0, 1.0
     blur_u, blur_v = blur_px
-    per_blur = config.lens_px / config.blur_px
+    wide_px = float(config.blur_px)
+    if cloud.map_views is not None:
+        wide_px = _map_blur(config.blur_px, 1.0)
+    per_blur = config.lens_px / wide_px
     return lens_side(per_blur * blur_u), lens_side(per_blur * blur_v)
 
 

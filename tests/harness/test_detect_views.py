@@ -45,7 +45,11 @@ FILES = [
     "report.html",
     "view3d.html",
 ]
-SHARP = ("--set", "hole_model.blur_px=1", "--threshold", "6.5")  # noise of this map reaches 5.8
+SHARP = (
+    *("--set", "hole_model.blur_px=1"),
+    *("--set", "hole_model.lens_px=0"),
+    *("--threshold", "6.5"),  # noise of this map reaches 5.8
+)
 """The board's hole is drawn without a camera's blur; the threshold is so high that no false call
 is expected."""
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.findings.hole_model import straight_sight
-from detectors.findings.measure import HoleModelConfig, blur_in_cells
+from detectors.findings.hole_model import lens_side, straight_sight
+from detectors.findings.measure import HoleModelConfig, _lens_sides, blur_in_cells
 from detectors.interface import Detection
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
 from detectors.views.mapping.merge import merge
@@ -92,6 +92,11 @@ def test_blur_in_cells() -> None:
     assert blur_in_cells(cloud, HoleModelConfig()) == pytest.approx(
         (2.0 * np.sqrt(27.0), 1.5 * np.sqrt(27.0)), rel=1e-9
     )
+    # the lens blurs pixels of two cells and of one and a half
+    sides = _lens_sides(
+        cloud, HoleModelConfig(lens_px=0.3), blur_in_cells(cloud, HoleModelConfig())
+    )
+    assert sides == pytest.approx((lens_side(0.6), lens_side(0.45)))
     coarse = replace(cloud, map_views=made_from(0.7e-3, 0.7e-3))
     assert blur_in_cells(coarse, HoleModelConfig()) == pytest.approx(
         (np.sqrt(27.0 / 4.0 + 1.0),) * 2, rel=1e-9
