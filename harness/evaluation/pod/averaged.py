@@ -200,8 +200,8 @@ def _narrowed(fit: HitMissFit, design_effect: float) -> tuple[np.ndarray, np.nda
     middle_ends = np.array([z.min() - range_z, z.max() + range_z])
     width_ends = np.array([least, np.log(WIDEST)])
     for _ in range(ZOOMS):
-        middles = np.linspace(*middle_ends, MIDDLES)
-        log_widths = np.linspace(*width_ends, WIDTHS)
+        middles = np.linspace(middle_ends[0], middle_ends[1], MIDDLES)
+        log_widths = np.linspace(width_ends[0], width_ends[1], WIDTHS)
         middle, log_width = (grid.ravel() for grid in np.meshgrid(middles, log_widths))
         width = np.exp(log_width)
         mu, sigma = curves_of(fit.curve.link, middle, width * range_z)

@@ -18,9 +18,11 @@ def rows_of_study(folder: Path) -> list[Audited]:
     """Return the coverage of stated diameters, depths and rates, for each set-up."""
     holes = api.table(folder, "trials")
     rows: list[Audited] = []
-    for keys, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
-        variant, frames, kind = keys
-        case = f"{variant}, {kind}, {frames} frame{'s' if frames > 1 else ''}"
+    for _, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
+        first = of_set_up.iloc[0]
+        frames = int(first["frames"])
+        plural = "" if frames == 1 else "s"
+        case = f"{first['variant']}, {first['kind']}, {frames} frame{plural}"
         rows += _sizes(of_set_up, case)
     rows += _rates(api.limits(folder))
     return rows
