@@ -19,9 +19,9 @@ def rows_of_study(folder: Path) -> list[Audited]:
     """Return the coverage of stated diameters, depths and rates, for each set-up."""
     holes = api.table(folder, "trials")
     rows: list[Audited] = []
-    for keys, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
-        variant, frames, kind = keys
-        case = f"{variant}, {kind}, {many(int(str(frames)), 'frame')}"
+    for _, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
+        first = of_set_up.iloc[0]
+        case = f"{first['variant']}, {first['kind']}, {many(int(first['frames']), 'frame')}"
         rows += _sizes(of_set_up, case)
     rows += _rates(api.limits(folder))
     return rows

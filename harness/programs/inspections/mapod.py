@@ -44,8 +44,7 @@ DRAWS = 999
 # stop rule: ratio of a90/95 to a90 at which no further board can lower a90/95 by more than this
 # factor
 ENOUGH = 1.2
-# 0.975: the quantile at which the handbook's likelihood ratio, which gives all other a90/95, has
-# its bound
+# 0.975: the quantile at which the handbook's likelihood ratio has its bound
 LIMIT_AT = float(stats.norm.cdf(np.sqrt(criterion(CONFIDENCE))))
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from harness.evaluation.study.limit import limit_of
-from harness.evaluation.study.record import read_record, record_text
+from harness.evaluation.study.record import ThresholdError, read_record, record_text
 from harness.evaluation.study.result import (
     StudyResult,
     conditions_of,
@@ -210,6 +210,19 @@ class TestValidity:
             )
         )[missing]
         assert not any("all are" in sentence or "one unit" in sentence for sentence in sections)
+
+    def test_conditions_state_the_interval_of_the_thresholds_rate(self, result):
+        """The lowest and the highest end of all set-ups that know theirs."""
+        facts = {"threshold": {"calibrate": {"false_calls_per_m2": 1.0}}}
+        assert "(" not in dataclasses.replace(result, facts=facts).conditions
+        set_ups = []
+        for set_up, ends in zip(result.set_ups, ((0.5, 1.7), (0.41, 1.6)), strict=True):
+            error = ThresholdError(0.1, *ends, "order statistics")
+            record = dataclasses.replace(set_up.limit.record, threshold_error=error)
+            limit = dataclasses.replace(set_up.limit, record=record)
+            set_ups.append(dataclasses.replace(set_up, limit=limit))
+        stated = dataclasses.replace(result, facts=facts, set_ups=tuple(set_ups)).conditions
+        assert stated == "threshold for 1 false call per m² (0.4 to 1.7)"
 
     def test_conditions_begin_with_the_damage_and_the_sizes_that_do_not_vary(self):
         gouges = {
