@@ -1,4 +1,4 @@
-"""How much more a target's rim varies than the noise farther in explains.
+"""The variance of a target's rim beyond that of the noise farther in.
 
 At an edge a camera's beam and filters mix what lies behind it into the pixels inside. The error is
 the same in all frames and units, changes with the place of the edge between two pixels, and falls

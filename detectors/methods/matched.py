@@ -111,8 +111,8 @@ class MatchedDetector(LocalDetector):
         covariance: np.ndarray | None = None,
         rim: np.ndarray | None = None,
     ) -> None:
-        """What `calibrate` has learned, in squared deviations: the noise's ``covariance``, and the
-        variances (n,) that the rim adds (`rim_variances`)."""
+        """``covariance``: the noise's. ``rim`` (n,): the variances that the rim adds
+        (`rim_variances`). Both are in squared deviations, as `calibrate` has learned them."""
         super().__init__(settings)
         self._covariance = covariance
         self._rim = rim

@@ -24,6 +24,7 @@ from detectors.findings.whitening import (
     grid_of,
 )
 from detectors.interface import Detection, Evidence
+from detectors.methods import local as local_methods
 from detectors.methods.local import LocalDetector
 from detectors.methods.matched import (
     CLIP_SIGMAS,
@@ -325,6 +326,17 @@ def test_the_errors_of_an_edge_are_no_damage(learns: bool) -> None:
     found = detector.find(cloud_of(deep), detector.analyse(cloud_of(deep)), 6.0)
     places = [np.unravel_index(detection.pixels[0], SHAPE) for detection in found]
     assert any(np.hypot(row - 45, column - 5) < 8.0 for row, column in places)
+
+
+def test_local_means_count_the_errors_of_an_edge_as_noise(monkeypatch) -> None:
+    local = LocalDetector(LocalDetector.settings_type.from_data({"crop": {"kind": "none"}}))
+    clouds = [cloud_of(3e-4 * (smooth(seed) + 2.0 * stepped(seed))) for seed in range(30, 34)]
+    plain = [rim_peak(local.analyse(cloud_of(3e-4 * smooth(seed)))) for seed in range(30, 34)]
+    aware = [rim_peak(local.analyse(cloud)) for cloud in clouds]
+    monkeypatch.setattr(local_methods, "_rim_variances", lambda noise, seen, reach_px: 0.0 * noise)
+    misled = [rim_peak(local.analyse(cloud)) for cloud in clouds]
+    assert np.mean(aware) < np.mean(plain) + 0.5
+    assert np.mean(misled) > np.mean(aware) + 1.0
 
 
 def test_wide_templates_fill_their_discs() -> None:
