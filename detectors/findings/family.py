@@ -129,9 +129,28 @@ class ShapeFit:
         by_stretch = 0.5 * diameter_m if fit.shape == "slot" else 0.0
         slopes = np.array([diameter_m / fit.radius_m, by_stretch])
         fitted_m2 = float(slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes)
+        share_m2 = (DIAMETER_ERROR[fit.shape] * diameter_m) ** 2
+        return self.raised * fitted_m2 + self._edge_m2 + share_m2
+
+    @property
+    def slot_errors(self) -> tuple[float, float, float]:
+        """Standard errors of a slot's length (m, twice the radius times the stretch), width (m)
+        and angle (rad)."""
+        fit = self.fit
+        width_m = 2.0 * fit.radius_m
+        length_m = width_m * math.exp(fit.stretch)
+        slopes = np.array([[length_m / fit.radius_m, length_m], [2.0, 0.0]])
+        fitted_m2 = slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes.T
+        shares_m2 = (DIAMETER_ERROR["slot"] * np.array([length_m, width_m])) ** 2
+        sides_m2 = self.raised * np.diag(fitted_m2) + self._edge_m2 + shares_m2
+        length_se_m, width_se_m = np.sqrt(sides_m2).tolist()
+        return length_se_m, width_se_m, math.sqrt(self.raised * fit.covariance[7, 7])
+
+    @property
+    def _edge_m2(self) -> float:
+        """Variance of a diameter by the error of the model's radius."""
         pixel_m2 = float(np.trace(self.patch.metric_m2)) / 2.0
-        edge_m2 = (2.0 * RADIUS_ERROR_PX) ** 2 * pixel_m2
-        return self.raised * fitted_m2 + edge_m2 + (DIAMETER_ERROR[fit.shape] * diameter_m) ** 2
+        return (2.0 * RADIUS_ERROR_PX) ** 2 * pixel_m2
 
     @property
     def depth_variance_m2(self) -> float:
