@@ -141,6 +141,12 @@ class Measurement:
     """Shorter side of that rectangle."""
     along: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,): direction of the longer side."""
+    length_se_m: float = np.nan
+    """Standard error of the length of a fitted slot."""
+    width_se_m: float = np.nan
+    """Standard error of its width."""
+    along_se_rad: float = np.nan
+    """Standard error of its direction on the surface."""
     normal_share: float = np.nan
     """Depth normal to the surface over the residual."""
     sight_share: float = np.nan

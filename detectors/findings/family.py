@@ -141,6 +141,21 @@ class ShapeFit:
         return self.raised * fitted_m2 + 4.0 * self.edge_variance_m2 + own_m2
 
     @property
+    def slot_errors(self) -> tuple[float, float, float]:
+        """Standard errors of a slot's length (m, twice the radius times the stretch), width (m)
+        and angle (rad)."""
+        fit = self.fit
+        width_m = 2.0 * fit.radius_m
+        length_m = width_m * math.exp(fit.stretch)
+        slopes = np.array([[length_m / fit.radius_m, length_m], [2.0, 0.0]])
+        fitted_m2 = slopes @ fit.covariance[np.ix_([2, 6], [2, 6])] @ slopes.T
+        shares_m2 = (DIAMETER_ERROR["slot"] * np.array([length_m, width_m])) ** 2
+        edges_m2 = 4.0 * self.edge_variance_m2
+        sides_m2 = self.raised * np.diag(fitted_m2) + edges_m2 + shares_m2
+        length_se_m, width_se_m = np.sqrt(sides_m2).tolist()
+        return length_se_m, width_se_m, math.sqrt(self.raised * fit.covariance[7, 7])
+
+    @property
     def edge_variance_m2(self) -> float:
         """Variance of the place of the mouth's edge by what the model leaves out of the blur."""
         pixel_m2 = float(np.trace(self.patch.metric_m2)) / 2.0

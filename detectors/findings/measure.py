@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from pydantic import Field, field_validator
 
-from detectors.findings.family import BLURS, DEPTH_ERROR, Size, Start, sized
+from detectors.findings.family import BLURS, DEPTH_ERROR, ShapeFit, Size, Start, sized
 from detectors.findings.hole_model import (
     HolePatch,
     lens_side,
@@ -249,12 +249,15 @@ def measure_detection(
 
 
 def _as_slot(measured: Measurement, around: _Surroundings, size: Size) -> Measurement:
-    """Return a measurement with the sides and the direction of a fitted slot."""
+    """Return a measurement with the sides and the direction of a fitted slot, and their errors."""
     fit = size.best
     sides_m = 2.0 * fit.radius_m * np.array([math.exp(fit.stretch), 1.0])
     angle_rad = fit.angle_rad
+    length_se_m, width_se_m, angle_se_rad = ShapeFit(fit, size.patch).slot_errors
+    errors_m = (length_se_m, width_se_m)
     if fit.stretch < 0.0:
         sides_m = sides_m[::-1]
+        errors_m = errors_m[::-1]
         angle_rad += 0.5 * math.pi
     right, down = around.axes
     return replace(
@@ -262,6 +265,9 @@ def _as_slot(measured: Measurement, around: _Surroundings, size: Size) -> Measur
         length_m=float(sides_m[0]),
         width_m=float(sides_m[1]),
         along=math.cos(angle_rad) * right + math.sin(angle_rad) * down,
+        length_se_m=errors_m[0],
+        width_se_m=errors_m[1],
+        along_se_rad=angle_se_rad,
     )
 
 

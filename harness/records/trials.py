@@ -600,7 +600,7 @@ class ResultTables:
 
 # ---------------------------------------------------------------- real captures
 
-FINDINGS_VERSION = 4
+FINDINGS_VERSION = 5
 """The version is increased when the meaning of a column or key changes; the last column of the CSV
 states it."""
 FINDINGS_OF_CAPTURE = Table(
@@ -648,6 +648,14 @@ FINDINGS_OF_CAPTURE = Table(
             "angle_deg",
             "angle of the rectangle's length from x towards y (down), -90 to 90",
         ),
+        Column(
+            "length_se_mm",
+            "",
+            "length_se_mm",
+            "standard error of the length of a fitted slot; empty for other shapes",
+        ),
+        Column("width_se_mm", "", "width_se_mm", "standard error of its width"),
+        Column("angle_se_deg", "", "angle_se_deg", "standard error of its angle"),
         Column(
             "noise_probability",
             "",

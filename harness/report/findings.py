@@ -92,6 +92,12 @@ class Finding:
     """The same as ``size_from``, ``extreme residual`` of the cluster's points, or ``none``."""
     depth_is_least: bool = False
     """True if the blur hides the floor, so that the damage may be deeper than stated."""
+    length_se_mm: float = math.nan
+    """Standard error of the length of a fitted slot; NaN for other shapes."""
+    width_se_mm: float = math.nan
+    """Standard error of its width."""
+    angle_se_deg: float = math.nan
+    """Standard error of its angle."""
     noise_probability: float = math.nan
     """Probability that it is a false call: noise, or what an object or print makes of the measured
     distance. NaN if the capture does not set its own threshold."""
@@ -220,6 +226,9 @@ def finding_of(
         length_mm=measured.length_m / MM,
         width_mm=measured.width_m / MM,
         angle_deg=angle_deg,
+        length_se_mm=measured.length_se_m / MM,
+        width_se_mm=measured.width_se_m / MM,
+        angle_se_deg=math.degrees(measured.along_se_rad),
         shape=measured.shape,
         size_from=size_from,
         depth_from=depth_from,

@@ -27,6 +27,8 @@ from harness.report.findings import finding_of
 from harness.vocabulary.errors import UserError
 from tests.support import recorded_plane as plane
 
+SLOT_ERRORS = ("length_se_mm", "width_se_mm", "angle_se_deg")
+"""Columns that are empty for round damage."""
 TRUE_CENTRE_MM = 1e3 * plane.points_m(plane.depth_mm(hole=False))[plane.HOLE_V, plane.HOLE_U]
 TRUE_DIAMETER_MM = 2 * plane.HOLE_RADIUS_PX * TRUE_CENTRE_MM[2] / plane.LENS.fx
 NO_BLUR = ("--set", "hole_model.blur_px=1")
@@ -150,10 +152,12 @@ def test_it_finds_the_hole_and_writes_everything(
     columns = "id,kind,u_px,v_px,x_mm,y_mm,z_mm,diameter_mm,diameter_se_mm,depth_mm,depth_se_mm"
     columns += ",sight_depth_mm,shape,volume_mm3,points,score,length_mm,width_mm"
     said = "noise_probability,certainty,flags,term,count"
-    assert header == f"{columns},angle_deg,{said},findings_version\n"
+    columns += ",angle_deg," + ",".join(SLOT_ERRORS)
+    assert header == f"{columns},{said},findings_version\n"
     (row,) = rows_of(out / "findings.csv")
     assert row["kind"] == "hole"
-    words = ("kind", "shape", "noise_probability", "certainty", "flags", "term")
+    assert not any(row[name] for name in SLOT_ERRORS)
+    words = ("kind", "shape", "noise_probability", "certainty", "flags", "term", *SLOT_ERRORS)
     number = {key: float(value) for key, value in row.items() if key not in words}
     assert (number["u_px"], number["v_px"]) == pytest.approx((plane.HOLE_U, plane.HOLE_V), abs=0.2)
     position = [number["x_mm"], number["y_mm"], number["z_mm"]]
@@ -200,7 +204,9 @@ def test_the_json_says_where_every_number_comes_from(capture: Path, tmp_path: Pa
     assert row["kind"] == finding["kind"] == "hole"
     assert [row[name] for name in ("certainty", "flags", "term")] == ["sure", "", "hole"]
     assert row["noise_probability"] == "" and finding["noise_probability"] is None
+    assert all(finding[name] is None for name in SLOT_ERRORS)
     for column in {column.name for column in FINDINGS_OF_CAPTURE.columns} - {
+        *SLOT_ERRORS,
         "kind",
         "shape",
         "noise_probability",

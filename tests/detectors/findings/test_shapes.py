@@ -281,3 +281,41 @@ def test_a_slot_s_angle_and_length_are_fitted() -> None:
     assert fit.converged
     np.testing.assert_allclose(fit.numbers[[0, 1, 6]], truth[[0, 1, 6]], atol=0.02)
     np.testing.assert_allclose(fit.numbers[[2, 3, 5]], truth[[2, 3, 5]], rtol=0.02)
+
+
+def test_a_slot_s_length_width_and_angle_lie_within_their_errors() -> None:
+    """In 24 draws of noise that the blur correlates: errors over standard errors have a root mean
+    square of about 1 for the angle, and less for the sides, whose errors contain the model's."""
+    patch = replace(patch_of(FRONTAL_PX_M), blur_px=(3.0, 3.0))
+    truth = numbers_of("slot")
+    clear_m = pictures(patch, truth[None], "slot")[0]
+    length_m = 2.0 * truth[2] * math.exp(truth[5])
+    pulls = []
+    for seed in range(24):
+        white = np.random.default_rng(seed).standard_normal(clear_m.shape)
+        noise_m = cv2.blur(white, (3, 3)) * 3.0 * 4e-4
+        seen = replace(patch, residual_m=clear_m + noise_m, noise_m=4e-4)
+        fit = fit_hole(
+            seen,
+            19.0,
+            18.0,
+            4e-3,
+            4e-3,
+            0.0,
+            shape="slot",
+            stretch=0.5,
+            angle_rad=0.4,
+        )
+        length_se_m, width_se_m, angle_se_rad = ShapeFit(fit, seen).slot_errors
+        width_m = 2.0 * fit.radius_m
+        pulls.append(
+            [
+                (width_m * math.exp(fit.stretch) - length_m) / length_se_m,
+                (width_m - 2.0 * truth[2]) / width_se_m,
+                (fit.angle_rad - truth[6]) / angle_se_rad,
+            ]
+        )
+    length, width, angle = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert 0.45 < length < 0.75
+    assert 0.45 < width < 0.75
+    assert 0.8 < angle < 1.2
