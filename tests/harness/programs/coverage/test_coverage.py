@@ -31,6 +31,7 @@ from harness.runs.options import EngineOptions
 from harness.runs.plan import batch_of, plan_of
 from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import UserError
+from scenes.target.custom import PoseConfig
 
 THRESHOLD = 5.0
 SCATTER = 0.15
@@ -220,11 +221,12 @@ PLACES_MM = (
     ((65, 140), (-30, 100), (-65, -20), (65, -70), (-20, -140)),
 )
 """Ten places on the pipe of 150 mm radius: five on each of two boards, 75 mm apart and more."""
+FRONTAL = PoseConfig(distance_m=0.7)
 
 
 def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[int, int], float]:
-    """Return a90 at each place, by hits of the experiment's own damage there, on boards in its own
-    random poses."""
+    """Return a90 at each place, by hits of the experiment's own damage there, on boards in the
+    surveyed pose: the unit's pattern stays on the pixels if the part moves."""
     (group,) = plan_of(load_experiment(Path("pipe")), cache).groups
     source = group.points[0].config.simulated
     task = survey.task
@@ -236,7 +238,11 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
         index = {flaw.id: positions[(n + number // 2) % 5] for n, flaw in enumerate(drawn.flaws)}
         flaws = tuple(flaw.model_copy(update={"centre_mm": index[flaw.id]}) for flaw in drawn.flaws)
         batch = batch_of(
-            drawn.model_copy(update={"flaws": flaws}), "damaged", source, cache, 1000 + number
+            drawn.model_copy(update={"flaws": flaws, "pose": FRONTAL}),
+            "damaged",
+            source,
+            cache,
+            1000 + number,
         )
         with engine_of(EngineOptions(serial=True)) as serial:
             assert not render_missing(batch.renders, serial)
@@ -277,7 +283,7 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
         )[:9]
         predicted.append(float(np.median(limits_mm[nearby])))
     ratio = np.array(predicted) / np.array(list(studied.values()))
-    # the program says that a single patch's limit may be wrong by 40 %
+    # the program says by 24 % at a single place; a limit from 24 gouges is uncertain by a tenth
     assert np.abs(np.log(ratio)).max() < np.log(1.45), dict(zip(studied, ratio, strict=True))
     assert np.sqrt(np.mean(np.log(ratio) ** 2)) < np.log(1.2)
 
