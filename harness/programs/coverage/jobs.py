@@ -4,8 +4,7 @@ often damage is found.
 The noise at a place is the detector's unit of score there, in metres: constant if the detector has
 one scale for the whole part, else measured nearby. The signal of damage and its scatter are
 learned from the detector's own scores on boards of the family, in random poses as wide as those
-requested. Not modelled: the direction of the undamaged part's error at a place (the unit's
-pattern, the surface's misfit), light of other parts, sizes in missing returns."""
+requested. Not modelled: light of other parts, sizes in missing returns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -124,7 +123,12 @@ def survey(
             seen = {}
             for pose, seen_of_view in zip(poses, seen_of_views, strict=True):
                 if seen_of_view is None:
-                    seen_of_view = Seen(blind, np.ones(len(blind)), np.ones(len(blind)))
+                    seen_of_view = Seen(
+                        deviation_m=blind,
+                        cosine=np.ones(len(blind)),
+                        range_m=np.ones(len(blind)),
+                        residual_m=np.zeros(len(blind)),
+                    )
                 seen[pose] = seen_of_view
             surveys.append(
                 Survey(point=point, task=task, patches=patches, found=findable_sizes, seen=seen)
@@ -237,21 +241,29 @@ def _inspections(
             f"{point.label or point.variant}: no damaged board was judged",
             fix="check the detector's crop",
         )
-    numbers, plan_mm, depth_mm, deviation_m, cosine, range_m, score = np.array(facts).T
+    numbers, plan_mm, depth_mm, deviation_m, cosine, range_m, residual_m, score = np.array(facts).T
     is_depth = np.ptp(plan_mm) < SAME_MM < np.ptp(depth_mm)
     return ScoredDamage(
         size_of="depth" if is_depth else boards[0][1][0][0].size_of,
         damage=numbers,
         size_mm=depth_mm if is_depth else plan_mm,
-        seen=Seen(deviation_m, cosine, range_m),
+        seen=Seen(
+            deviation_m=deviation_m,
+            cosine=cosine,
+            range_m=range_m,
+            residual_m=residual_m,
+        ),
         score=score,
     )
 
 
-def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
-    """Return the detector's unit of score (h, w) on a hole-free board, metres: residual over
-    score, rms around each pixel; larger if some pixels or averages are not judged, infinite if
-    most are not."""
+def _unit_and_residual_m(
+    batch: Batch, point: TrialPoint, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return two fields (h, w) of a hole-free board, metres. The detector's unit of score is its
+    residual over its score, rms around each pixel; larger if some pixels or averages are not
+    judged, infinite if most are not. The residual is the mean of the averages around each pixel,
+    0 where nothing is judged."""
     fields = []
     for repeat in range(DRAWS):
         task = Trial(
@@ -266,39 +278,44 @@ def _unit_m(batch: Batch, point: TrialPoint, seed: int) -> np.ndarray:
         detector = detector_of(criteria.detector, criteria.settings_json, criteria.learned)
         evidence = detector.analyse(cloud_of(task, point))
         is_judged = np.isfinite(evidence.score)
-        residual_square_m2 = np.where(is_judged, evidence.residual_m**2, 0.0)
+        residual_m = np.where(is_judged, evidence.residual_m, 0.0)
         score_square = np.where(is_judged, evidence.score**2, 0.0)
-        fields.append([is_judged, residual_square_m2, score_square])
-    judged_share, residual_square_m2, score_square = np.mean(fields, axis=0)
+        fields.append([is_judged, residual_m, residual_m**2, score_square])
+    judged_share, residual_m, residual_square_m2, score_square = np.mean(fields, axis=0)
     residual_square_m2 = ndimage.uniform_filter(residual_square_m2, AROUND_PX)
     score_square = ndimage.uniform_filter(score_square, AROUND_PX)
     judged = (judged_share >= 0.5) & (residual_square_m2 > 0) & (score_square > 0)
     judged_share_nearby = ndimage.uniform_filter(judged_share, NEAR_PX)
     with np.errstate(divide="ignore", invalid="ignore"):
         unit_m = np.sqrt(residual_square_m2 / score_square / judged_share_nearby)
-    return np.where(judged, unit_m, np.inf)
+        around_m = ndimage.uniform_filter(residual_m, AROUND_PX) / ndimage.uniform_filter(
+            judged_share, AROUND_PX
+        )
+    return np.where(judged, unit_m, np.inf), np.where(judged, around_m, 0.0)
 
 
 def _board_seen(
     batch: Batch, whole_batch: Batch, point: TrialPoint, seed: int
-) -> tuple[int, list[tuple[Damage, tuple[float, float, float]]]]:
+) -> tuple[int, list[tuple[Damage, tuple[float, float, float, float]]]]:
     """Return a damaged board's number, and its damages with the view of each (`Seen`) on the board
     without damage."""
     set_up = load_board(batch.views[0])
-    unit_m = _unit_m(whole_batch, point, seed)
+    unit_m, residual_m = _unit_and_residual_m(whole_batch, point, seed)
     seen_damages = []
     for damage in set_up.truth:
         range_m = float(np.linalg.norm(damage.centre_camera_m))
         cosine = float(-damage.axis_camera @ damage.centre_camera_m) / range_m
-        about_m = float(np.median(unit_m.ravel()[set_up.outlines[damage.id]]))
-        seen_damages.append((damage, (about_m, cosine, range_m)))
+        outline = set_up.outlines[damage.id]
+        about_m = float(np.median(unit_m.ravel()[outline]))
+        background_m = float(np.mean(residual_m.ravel()[outline])) if len(outline) else 0.0
+        seen_damages.append((damage, (about_m, cosine, range_m, background_m)))
     return batch.board or 0, seen_damages
 
 
 def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> Seen:
     """Return the view and the noise of the patches of an undamaged part."""
     set_up = load_board(view.views[0])
-    deviation_m = _unit_m(view, point, seed)
+    deviation_m, residual_m = _unit_and_residual_m(view, point, seed)
     points_m = transform_points(set_up.T_camera_board, patches.points_m)
     range_m = np.linalg.norm(points_m, axis=1)
     normals = rotate_vectors(set_up.T_camera_board, patches.normals)
@@ -325,4 +342,5 @@ def _part_seen(view: Batch, point: TrialPoint, seed: int, patches: Patches) -> S
         deviation_m=np.where(is_seen, deviation_m[v, u], np.inf),
         cosine=np.clip(cosine, 1e-3, 1.0),
         range_m=range_m,
+        residual_m=np.where(is_seen, residual_m[v, u], 0.0),
     )

@@ -31,6 +31,7 @@ from harness.runs.options import EngineOptions
 from harness.runs.plan import batch_of, plan_of
 from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.errors import UserError
+from scenes.target.custom import PoseConfig
 
 ONE_DETECTOR = "sweep.detector.name=[thesis]"
 THRESHOLD = 5.0
@@ -44,18 +45,26 @@ def signal_m(size_mm: np.ndarray, seen: Seen) -> np.ndarray:
     )
 
 
-def inspections(count: int, looks: int = 4, growth: float = 1.0) -> ScoredDamage:
+def inspections(
+    count: int, looks: int = 4, growth: float = 1.0, share: float = 0.0
+) -> ScoredDamage:
     """Damages of `signal_m`, with a logarithmic scatter of `SCATTER` over a power of the angle's
-    cosine."""
+    cosine, to which a share of the undamaged part's residual adds."""
     rng = np.random.default_rng(3)
     damage = np.repeat(np.arange(count), looks)
     size_mm = rng.uniform(0.5, 8, count)
     cosine = rng.uniform(0.4, 1, count)
     range_m = rng.uniform(0.6, 0.9, count)
-    seen = Seen(rng.uniform(1e-3, 3e-3, count)[damage], cosine[damage], range_m[damage])
+    seen = Seen(
+        deviation_m=rng.uniform(1e-3, 3e-3, count)[damage],
+        cosine=cosine[damage],
+        range_m=range_m[damage],
+        residual_m=rng.normal(0.0, 1e-3, count)[damage],
+    )
     size_mm = size_mm[damage]
     noise = rng.standard_normal(len(damage)) * SCATTER / seen.cosine**growth
-    score = signal_m(size_mm, seen) / seen.deviation_m * np.exp(noise)
+    whole_m = signal_m(size_mm, seen) * np.exp(noise) + share * seen.residual_m
+    score = whole_m / seen.deviation_m
     return ScoredDamage("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
 
 
@@ -70,7 +79,7 @@ def test_a_patch_has_the_size_whose_signal_is_needed() -> None:
         1, abs=0.25
     )
     unit_m = np.array([1e-3, 2e-3, 1e-3, 12e-3, np.inf, 1e-3])
-    places = Seen(unit_m, np.array([1, 1, 0.5, 0.5, 1, 0.3]), np.full(6, 0.7))
+    places = Seen(unit_m, np.array([1, 1, 0.5, 0.5, 1, 0.3]), np.full(6, 0.7), np.zeros(6))
     needed_m = THRESHOLD * unit_m * np.exp(1.2816 * SCATTER / places.cosine)
     wanted = (needed_m / signal_m(np.ones(6), places)) ** (1 / 1.5)
     limits_mm = result.limits_mm(places)
@@ -79,6 +88,24 @@ def test_a_patch_has_the_size_whose_signal_is_needed() -> None:
         np.isinf(limits_mm[3]) and np.isnan(limits_mm[4:]).all()
     )  # too large; not judged, steeper than all inspected
     assert wanted[3] > result.sizes_mm[1]
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.0, 0.5, 1.0])
+def test_what_an_undamaged_place_shows_adds_to_damage_there(share: float) -> None:
+    """By the share that the scores tell, so that a residual towards the damage makes it easier to
+    find."""
+    law = findable(inspections(1500, share=share), THRESHOLD)
+    assert law.share == pytest.approx(share, abs=0.25)  # a step; 281 damages tell it within 0.15
+    residual_m = np.array([0.0, 2e-3, -2e-3])
+    places = Seen(np.full(3, 2e-3), np.ones(3), np.full(3, 0.7), residual_m)
+    needed_m = (THRESHOLD * 2e-3 - law.share * residual_m) * np.exp(1.2816 * SCATTER)
+    wanted = (needed_m / signal_m(np.ones(3), places)) ** (1 / 1.5)
+    assert law.limits_mm(places) == pytest.approx(wanted, rel=0.05)
+
+
+def test_a_place_that_exceeds_the_threshold_undamaged_needs_little() -> None:
+    alone = Seen(np.array([1e-3]), np.ones(1), np.ones(1), np.array([9e-3]))
+    assert alone.signal_m(THRESHOLD, 1.0) == pytest.approx([0.05 * THRESHOLD * 1e-3])
 
 
 def test_misses_that_size_angle_and_distance_do_not_explain_are_told() -> None:
@@ -104,7 +131,7 @@ def test_misses_that_size_angle_and_distance_do_not_explain_are_told() -> None:
 
 def test_too_few_damages_teach_nothing() -> None:
     sample = inspections(30)
-    blind = Seen(np.full(120, np.inf), sample.seen.cosine, sample.seen.range_m)
+    blind = replace(sample.seen, deviation_m=np.full(120, np.inf))
     with pytest.raises(UserError, match="only 0 of 30 damages"):
         findable(replace(sample, seen=blind), THRESHOLD)
 
@@ -195,11 +222,12 @@ PLACES_MM = (
     ((65, 140), (-30, 100), (-65, -20), (65, -70), (-20, -140)),
 )
 """Ten places on the pipe of 150 mm radius: five on each of two boards, 75 mm apart and more."""
+FRONTAL = PoseConfig(distance_m=0.7)
 
 
 def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[int, int], float]:
-    """Return a90 at each place, by hits of the experiment's own damage there, on boards in its own
-    random poses."""
+    """Return a90 at each place, by hits of the experiment's own damage there, on boards in the
+    surveyed pose: the unit's pattern stays on the pixels if the part moves."""
     (group,) = plan_of(load_experiment(Path("pipe"), [ONE_DETECTOR]), cache).groups
     source = group.points[0].config.simulated
     task = survey.task
@@ -211,7 +239,11 @@ def studied_mm(survey: engine.Survey, boards: int, cache: Path) -> dict[tuple[in
         index = {flaw.id: positions[(n + number // 2) % 5] for n, flaw in enumerate(drawn.flaws)}
         flaws = tuple(flaw.model_copy(update={"centre_mm": index[flaw.id]}) for flaw in drawn.flaws)
         batch = batch_of(
-            drawn.model_copy(update={"flaws": flaws}), "damaged", source, cache, 1000 + number
+            drawn.model_copy(update={"flaws": flaws, "pose": FRONTAL}),
+            "damaged",
+            source,
+            cache,
+            1000 + number,
         )
         with engine_of(EngineOptions(serial=True)) as serial:
             assert not render_missing(batch.renders, serial)
@@ -252,7 +284,7 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
         )[:9]
         predicted.append(float(np.median(limits_mm[nearby])))
     ratio = np.array(predicted) / np.array(list(studied.values()))
-    # the program says that a single patch's limit may be wrong by 40 %
+    # the program says by 24 % at a single place; a limit from 24 gouges is uncertain by a tenth
     assert np.abs(np.log(ratio)).max() < np.log(1.45), dict(zip(studied, ratio, strict=True))
     assert np.sqrt(np.mean(np.log(ratio) ** 2)) < np.log(1.2)
 
@@ -265,11 +297,17 @@ def test_the_limit_is_at_least_the_smallest_size_inspected():
         coefficients=np.array([10.0, 1.0, 0.0, 0.0, 0.0]),
         scatter=0.1,
         growth=0.0,
+        share=0.0,
         ratio=1.1,
         threshold=1e-3,
         sizes_mm=(2.0, 8.0),
         steepest=0.5,
         damages=30,
     )
-    frontal = Seen(deviation_m=np.full(3, 1e-3), cosine=np.ones(3), range_m=np.full(3, 0.7))
+    frontal = Seen(
+        deviation_m=np.full(3, 1e-3),
+        cosine=np.ones(3),
+        range_m=np.full(3, 0.7),
+        residual_m=np.zeros(3),
+    )
     assert law.limits_mm(frontal).tolist() == [2.0, 2.0, 2.0]

@@ -18,7 +18,7 @@ from harness.programs.coverage.jobs import (
     _board_seen,
     _inspections,
     _part_seen,
-    _unit_m,
+    _unit_and_residual_m,
     _widened,
     declared,
     patches_of,
@@ -176,11 +176,11 @@ def test_inspections_are_the_scores_of_each_damage() -> None:
         (
             3,
             [
-                (damage_of(1, 0.005, 0.002), (1e-3, 0.9, 0.7)),
-                (damage_of(2, 0.008, 0.002), (2e-3, 0.8, 0.6)),
+                (damage_of(1, 0.005, 0.002), (1e-3, 0.9, 0.7, 1e-4)),
+                (damage_of(2, 0.008, 0.002), (2e-3, 0.8, 0.6, 2e-4)),
             ],
         ),
-        (4, [(damage_of(1, 0.006, 0.002), (3e-3, 0.7, 0.5))]),
+        (4, [(damage_of(1, 0.006, 0.002), (3e-3, 0.7, 0.5, -3e-4))]),
     ]
     scores = {
         ("v", 5, 3, "1"): [7.0, np.nan],
@@ -195,14 +195,15 @@ def test_inspections_are_the_scores_of_each_damage() -> None:
     assert table.seen.deviation_m.tolist() == [1e-3, 1e-3, 3e-3]
     assert table.seen.cosine.tolist() == [0.9, 0.9, 0.7]
     assert table.seen.range_m.tolist() == [0.7, 0.7, 0.5]
+    assert table.seen.residual_m.tolist() == [1e-4, 1e-4, -3e-4]
     assert table.score[[0, 2]].tolist() == [7.0, np.inf]
     assert np.isnan(table.score[1])
     deep = [
         (
             3,
             [
-                (damage_of(1, 0.005, 0.002), (1e-3, 0.9, 0.7)),
-                (damage_of(2, 0.005, 0.003), (2e-3, 0.8, 0.6)),
+                (damage_of(1, 0.005, 0.002), (1e-3, 0.9, 0.7, 1e-4)),
+                (damage_of(2, 0.005, 0.003), (2e-3, 0.8, 0.6, 2e-4)),
             ],
         )
     ]
@@ -234,7 +235,8 @@ def test_the_unit_of_score_is_residual_over_score_nearby(monkeypatch: pytest.Mon
     monkeypatch.setattr(jobs, "Trial", lambda **facts: SimpleNamespace(**facts))
     criteria = SimpleNamespace(detector="d", settings_json="{}", learned=None)
     batch: Any = SimpleNamespace(before=lambda repeat: (), board=1)
-    unit_m = _unit_m(batch, SimpleNamespace(criteria=criteria), 1)  # type: ignore[arg-type]
+    point: Any = SimpleNamespace(criteria=criteria)
+    unit_m, around_m = _unit_and_residual_m(batch, point, 1)
     judged = np.isfinite(score)
     share = judged.mean(axis=0)
     residual_square = np.where(judged, residual_m**2, 0.0).mean(axis=0)
@@ -246,6 +248,10 @@ def test_the_unit_of_score_is_residual_over_score_nearby(monkeypatch: pytest.Mon
     square /= ndimage.convolve(share, near)[:, 30:]
     assert np.isinf(unit_m[:, :30]).all()
     assert unit_m[:, 30:] == pytest.approx(np.sqrt(square), rel=1e-6)
+    residual = ndimage.convolve(np.where(judged, residual_m, 0.0).mean(axis=0), window)
+    assert (around_m[:, :30] == 0).all()
+    mean_m = residual[:, 30:] / ndimage.convolve(share, window)[:, 30:]
+    assert around_m[:, 30:] == pytest.approx(mean_m, rel=1e-6)
 
 
 def test_damage_is_seen_from_its_own_place(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,13 +265,14 @@ def test_damage_is_seen_from_its_own_place(monkeypatch: pytest.MonkeyPatch) -> N
     )
     set_up = SimpleNamespace(truth=(damage,), outlines={7: np.array([1, 2, 9])})
     monkeypatch.setattr(jobs, "load_board", lambda ref: set_up)
-    monkeypatch.setattr(jobs, "_unit_m", lambda *_: unit_m)
+    monkeypatch.setattr(jobs, "_unit_and_residual_m", lambda *_: (unit_m, unit_m**2))
     batch: Any = SimpleNamespace(views=("a view",), board=5)
     number, ((found, seen),) = _board_seen(batch, batch, None, 1)  # type: ignore[arg-type]
     assert number == 5
     assert found is damage
     # a cosine of 0.8 x 0.4 / 0.5
-    assert seen == pytest.approx((2.0, 0.64, 0.5))
+    # the mean of 1, 4 and 81
+    assert seen == pytest.approx((2.0, 0.64, 0.5, 86.0 / 3.0))
     batch.board = None
     assert _board_seen(batch, batch, None, 1)[0] == 0  # type: ignore[arg-type]
 
@@ -285,7 +292,7 @@ def seen_by(monkeypatch: pytest.MonkeyPatch, points_m: Any, normals: Any, in_fro
     rows, columns = REGION.shape
     unit_m = np.arange(float(rows * columns)).reshape(rows, columns)
     monkeypatch.setattr(jobs, "load_board", lambda ref: set_up)
-    monkeypatch.setattr(jobs, "_unit_m", lambda *_: unit_m)
+    monkeypatch.setattr(jobs, "_unit_and_residual_m", lambda *_: (unit_m, 2.0 * unit_m))
     patches = Patches(np.array(points_m), np.array(normals), np.ones(len(points_m)))
     return _part_seen(SimpleNamespace(views=("a view",)), None, 1, patches)  # type: ignore[arg-type]
 
@@ -309,6 +316,7 @@ def test_patches_have_the_noise_of_their_pixels(monkeypatch: pytest.MonkeyPatch)
     columns = REGION.shape[1]
     corners = [0, columns - 1, 39 * columns, 40 * columns - 1]
     assert seen.deviation_m.tolist() == [*corners, np.inf, np.inf, np.inf, np.inf]
+    assert seen.residual_m.tolist() == [*(2 * corner for corner in corners), 0, 0, 0, 0]
     ranges_m = np.linalg.norm(points, axis=1)
     assert seen.range_m == pytest.approx(ranges_m)
     assert seen.cosine == pytest.approx(-(np.array(points) @ FACING) / ranges_m)
