@@ -7,7 +7,8 @@ trained on, this is the logarithm of a likelihood ratio L, and
     score = sqrt(2 ln(1 + L))
 
 is in deviations, as a matched filter's score s has ln L = s^2 / 2. What lies in front of the
-surface is judged by the same network on the residuals with their sign reversed.
+surface is judged by the same network on the residuals with their sign reversed. From ln(1 + L) a
+share of the largest of the other sign nearby is subtracted, as side lobes of the whitening have it.
 
 Not modelled: what the training frames did not show. Noise of other cameras is whitened to the same
 deviation, but a mixture of pixels at edges that no training frame had may look like damage. Scores
@@ -19,10 +20,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from detectors.methods.matched import MatchedConfig, MatchedDetector
+from detectors.methods.matched import (
+    LOBE_SHARE,
+    RIM_PX,
+    MatchedConfig,
+    MatchedDetector,
+    Whitened,
+)
 from detectors.methods.network import Network, read_network
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest
@@ -84,9 +92,15 @@ class LearnedDetector(MatchedDetector):
         sees the rim as it is: variances of its own are not taken off."""
         whitened = self.whitened(residual_m, weights, rounding_m2)
         network = self.network
-        behind = _score(network, seen_by_network(whitened.values, whitened.known, 1.0))
-        before = _score(network, seen_by_network(whitened.values, whitened.known, -1.0))
-        signed = np.where(behind >= before, behind, -before) * whitened.known
+        behind = _evidence(network, whitened, 1.0)
+        before = _evidence(network, whitened, -1.0)
+        # what lies beside stronger evidence of the other sign is a side lobe of the whitening
+        reach = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+        alone_behind = behind - LOBE_SHARE * cv2.dilate(before, reach)
+        alone_before = before - LOBE_SHARE * cv2.dilate(behind, reach)
+        strongest = np.maximum(alone_behind, alone_before)
+        side = np.where(alone_behind >= alone_before, 1.0, -1.0)
+        signed = side * np.sqrt(2.0 * np.maximum(strongest, 0.0)) * whitened.known
         deviation_m = float(np.median(whitened.unit_m[whitened.known]))
         unit = (
             "the root of twice the logarithm of a network's likelihood ratio; the noise of a pixel"
@@ -122,7 +136,8 @@ def seen_by_network(values: np.ndarray, known: np.ndarray, sign: float) -> np.nd
     return np.stack([shrunk * known, known]).astype(np.float32)
 
 
-def _score(network: Network, pictures: np.ndarray) -> np.ndarray:
-    """Return scores (r, c), at least 0."""
+def _evidence(network: Network, whitened: Whitened, sign: float) -> np.ndarray:
+    """Return ln(1 + L) (r, c) float32 for the residuals times a sign."""
+    pictures = seen_by_network(whitened.values, whitened.known, sign)
     log_ratio = network.log_odds(pictures) - np.float32(network.prior_log_odds)
-    return np.sqrt(2.0 * np.logaddexp(0.0, log_ratio))
+    return np.logaddexp(np.float32(0.0), log_ratio)

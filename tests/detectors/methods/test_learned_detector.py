@@ -85,7 +85,8 @@ def test_a_score_is_the_root_of_twice_the_logarithm_of_the_likelihood_ratio(tmp_
     row, column = 42, 52
     log_ratio = float(seen[row - 1 : row + 2, column - 1 : column + 2].sum())
     expected = np.sqrt(2 * np.log1p(np.exp(log_ratio)))
-    assert evidence.score[row, column] == pytest.approx(expected, rel=1e-4)
+    assert evidence.score[row, column] == pytest.approx(expected, rel=0.05)
+    assert evidence.score[row, column] <= expected
     assert evidence.score[row, column] > 6.0
 
 
@@ -93,7 +94,7 @@ def test_what_lies_in_front_is_judged_as_what_lies_behind(tmp_path):
     detector = detector_of(sum_of_nine(tmp_path / "n.npz"))
     cloud = damaged()
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, 9.0)
+    found = detector.find(cloud, evidence, 8.0)
     assert len(found) == 2
     assert evidence.behind is not None
     assert evidence.behind[HOLE].all()
@@ -101,6 +102,23 @@ def test_what_lies_in_front_is_judged_as_what_lies_behind(tmp_path):
     turned = replace(cloud, points_m=cloud.points_m * [1, 1, -1] + [0, 0, 1.4])
     mirrored = detector.analyse(turned)
     np.testing.assert_allclose(mirrored.score, evidence.score, rtol=0.05, atol=0.05)
+
+
+def test_a_side_lobe_beside_stronger_evidence_is_no_finding(tmp_path):
+    """A weaker pixel of the other sign within the reach is none, and farther away it is one."""
+    detector = detector_of(sum_of_nine(tmp_path / "n.npz"))
+    scores = {}
+    for distance in (5, 12):
+        residual_m = np.full((60, 60), 1e-9)
+        residual_m[30:33, 30:33] = 1e-2
+        residual_m[30:33, 30 + distance : 33 + distance] = -7e-3
+        noise_m = 1e-3 * np.random.default_rng(8).standard_normal((60, 60))
+        known = np.ones((60, 60), np.float32)
+        signed, _, _ = detector.scored(residual_m + noise_m, known, (0.0, 0.0))
+        scores[distance] = signed[31, 31 + distance]
+        assert signed[31, 31] > 8.0
+    assert scores[12] < -5.0
+    assert abs(scores[5]) < 0.8 * abs(scores[12])
 
 
 def test_a_learned_covariance_whitens(tmp_path):
