@@ -9,6 +9,11 @@ a family, if its verdict changes. The change must exceed 5 %. Camera and moved c
 with the same noise, in fewer frames than the scorecard's, so verdicts near a limit may differ from
 it.
 
+Of an untested constant, the list also names what limits of damage hang on and the move changes by
+more than 5 %: noise and its correlation between neighbours, the fixed pattern, missing returns, and
+pixels beside an edge, all at 0.7 m. A limit that is stated for the camera hangs on a constant for
+which it names something, though no figure says that it is right.
+
 Not moved: the lens, the places and cones of lights, choices of a rule, and numbers that are 0 and
 state no range."""
 
@@ -17,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +36,7 @@ from harness.programs.scorecard.figures import (
     Score,
     measured,
 )
-from harness.programs.scorecard.quantities import Quantity
+from harness.programs.scorecard.quantities import QUANTITIES, Quantity
 from harness.records.schema import Column, Table
 from harness.stills.statistics import Reading
 from harness.vocabulary.declaration.yaml_source import read_yaml
@@ -66,6 +71,37 @@ EFFECT_OF = {
 }
 """Effects without which a constant acts on nothing, by the beginning of its key."""
 HALVINGS = 4  # of a step that leads to an illegal number, such as a contrast above 1
+NEIGHBOURS = 2  # to which a whole number goes if no step leads to a legal one, such as windows
+
+
+class Hinge(NamedTuple):
+    """Something on which limits of damage hang."""
+
+    words: str
+    """Its name."""
+    quantity: str
+    """What is measured."""
+    conditions: dict[str, Any]
+    """Its conditions."""
+
+    def request(self, camera: str, numbers: tuple[tuple[str, Any], ...]) -> Request:
+        """Return its measurement on a camera with replaced numbers."""
+        conditions = QUANTITIES[self.quantity].conditions.from_data(self.conditions)
+        return Request(camera, self.quantity, conditions, numbers)
+
+
+BOARD = {"distance_m": 0.7, "albedo": 0.6}
+HINGES = (
+    Hinge("noise", "temporal_sigma_mm", BOARD),
+    Hinge("correlation", "noise_correlation", BOARD),
+    Hinge("pattern", "patch_pattern_mm", {**BOARD, "patch_px": 9}),
+    Hinge("missing returns", "valid_fraction", {"distance_m": 0.7, "albedo": 0.1}),
+    Hinge("pixels at rims", "flying_pixels_px", {**BOARD, "step_mm": 20.0}),
+    Hinge("gaps at rims", "edge_gap_px", {**BOARD, "step_mm": 500.0}),
+)
+"""On a board of pale wood: holes with a wall close behind have steps of some 20 mm at their rims,
+open ones of hundreds."""
+NOT_MOVED_WORDS = "not moved"
 UNTESTED_FILE = Path(__file__).with_name("untested.yaml")
 
 
@@ -92,6 +128,11 @@ class Constant:
             if value != self.value and _is_legal(self.camera, self.key, value):
                 return value
             step /= 2
+        if isinstance(self.value, int):
+            for distance in range(1, NEIGHBOURS + 1):
+                value = self.value + distance if upwards else self.value - distance
+                if _is_legal(self.camera, self.key, value):
+                    return value
         return None
 
     def _stepped(self, upwards: bool, step: float) -> Any:
@@ -169,6 +210,8 @@ class Moved:
     """Names of the figures and families that notice the move down."""
     noticed_raised: tuple[str, ...]
     """Names of those that notice the move up."""
+    hinges: tuple[str, ...]
+    """What a move of an untested constant changes, of all on which limits of damage hang."""
 
     @property
     def can_move(self) -> bool:
@@ -233,12 +276,9 @@ class _Move:
 def _is_noticed(old: Score, new: Score) -> bool:
     """Return whether a figure's grade changes, and its value by more than noise changes it."""
     old_value = old.simulated.value
-    new_value = new.simulated.value
-    if np.isnan(old_value) or np.isnan(new_value):
-        return bool(np.isnan(old_value) != np.isnan(new_value))
-    change = abs(new_value - old_value)
-    is_evident = change > LEAST_CHANGE * abs(old_value)
-    return old.grade != new.grade and is_evident
+    is_evident = _differs(old_value, new.simulated.value, scale=abs(old_value))
+    has_no_value = np.isnan([old_value, new.simulated.value]).any()
+    return bool(is_evident and (has_no_value or old.grade != new.grade))
 
 
 def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved]:
@@ -266,6 +306,12 @@ def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved
         readings |= measured(missing, BRIEF, jobs)
         for key, move in tried.items():
             noticed[key] = move.noticed(file.families, readings)
+    untested_moves = {}
+    for (constant, upwards), value in moves.items():
+        is_noticed = noticed[constant, False] or noticed[constant, True]
+        if value is not None and not is_noticed:
+            untested_moves[constant, upwards] = value
+    hinges = _hinges_of(untested_moves, jobs)
     return [
         Moved(
             constant=constant,
@@ -273,9 +319,40 @@ def power_of(file: FiguresFile, cameras: Sequence[str], jobs: int) -> list[Moved
             raised=moves[constant, True],
             noticed_lowered=noticed[constant, False],
             noticed_raised=noticed[constant, True],
+            hinges=hinges.get(constant, ()),
         )
         for constant in constants
     ]
+
+
+def _hinges_of(
+    moves: Mapping[tuple[Constant, bool], Any], jobs: int
+) -> dict[Constant, tuple[str, ...]]:
+    """Return what each constant changes when it is moved, of all on which limits hang."""
+    requests = {}
+    for (constant, upwards), value in moves.items():
+        for hinge in HINGES:
+            if _acts(constant.key, QUANTITIES[hinge.quantity]):
+                request = hinge.request(constant.camera, ((constant.key, value),))
+                requests[constant, upwards, hinge.words] = request
+    distinct = set(requests.values())
+    distinct |= {request._replace(numbers=()) for request in distinct}
+    readings = measured(sorted(distinct, key=repr), BRIEF, jobs)
+    changed: dict[Constant, dict[str, None]] = {}
+    for (constant, _, words), request in requests.items():
+        before = readings[request._replace(numbers=())].value
+        after = readings[request].value
+        is_in_mm = QUANTITIES[request.quantity].unit == "mm"
+        if _differs(before, after, scale=abs(before) if is_in_mm else 1.0):
+            changed.setdefault(constant, {})[words] = None
+    return {constant: tuple(words) for constant, words in changed.items()}
+
+
+def _differs(before: float, after: float, scale: float) -> bool:
+    """Return whether a reading changed by more than noise changes it, or appeared or went."""
+    if np.isnan(before) or np.isnan(after):
+        return bool(np.isnan(before) != np.isnan(after))
+    return abs(after - before) > LEAST_CHANGE * scale
 
 
 def _figures(
@@ -302,28 +379,34 @@ def _acts(key: str, quantity: Quantity) -> bool:
     return True
 
 
-def untested(results: Sequence[Moved]) -> dict[str, list[str]]:
-    """Return the keys of the constants that nothing notices, by camera."""
-    keys: dict[str, list[str]] = {}
+UntestedConstants = dict[str, dict[str, str]]
+"""By camera and key: what the constant changes of all on which limits hang, or ``not moved``."""
+
+
+def untested(results: Sequence[Moved]) -> UntestedConstants:
+    """Return the constants that nothing notices."""
+    constants: UntestedConstants = {}
     for result in results:
         if not result.names:
-            keys.setdefault(result.constant.camera, []).append(result.constant.key)
-    return keys
+            words = ", ".join(result.hinges) if result.can_move else NOT_MOVED_WORDS
+            constants.setdefault(result.constant.camera, {})[result.constant.key] = words or "none"
+    return constants
 
 
-def untested_text(keys: Mapping[str, Sequence[str]]) -> str:
+def untested_text(constants: Mapping[str, Mapping[str, str]]) -> str:
     """Return the file of untested constants."""
     lines = [
         "# The constants of the cameras that no blind figure or family of figures.yaml notices",
-        "# when they are moved. `tofpod validate --power` writes it, and fails where it disagrees.",
+        "# when they are moved, each with what it changes of all on which limits of damage hang.",
+        "# `tofpod validate --power` writes it, and fails where it disagrees.",
     ]
-    for camera, names in keys.items():
-        lines += [f"{camera}:", *(f"  - {name}" for name in names)]
+    for camera, words_by_key in constants.items():
+        lines += [f"{camera}:", *(f"  {key}: {words}" for key, words in words_by_key.items())]
     return "\n".join(lines) + "\n"
 
 
-def stored_untested(cameras: Sequence[str]) -> dict[str, list[str]]:
-    """Return the keys on file for some cameras."""
+def stored_untested(cameras: Sequence[str]) -> UntestedConstants:
+    """Return the constants on file for some cameras."""
     data = read_yaml(UNTESTED_FILE).data
     return {camera: data[camera] for camera in cameras if camera in data}
 
@@ -398,6 +481,14 @@ POWER = Table(
             "verdict",
             "noticed, untested, or not moved (0 without a range, or no other legal value)",
             tone=lambda row: TONES[row.verdict],
+        ),
+        Column(
+            "hinges",
+            "limits hang on its",
+            "hinges",
+            "what the moves of an untested constant change, of all on which limits hang",
+            _names_text,
+            brief=_names_text,
         ),
         Column("results_version", "", lambda row: RESULTS_VERSION, "version of the format"),
     ),

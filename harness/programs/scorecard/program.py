@@ -152,17 +152,20 @@ def _name_failures(scores: Sequence[scoring.Score], families: Sequence[FamilySco
 def _compare_untested(moved: Sequence[power.Moved], cameras: Sequence[str], out: Path) -> bool:
     """Return whether the constants that nothing notices are those on file; otherwise write the
     file that would agree and name the differences."""
-    keys = power.untested(moved)
+    constants = power.untested(moved)
     stored = power.stored_untested(cameras)
-    if keys == stored:
+    if constants == stored:
         return True
     file_name = power.UNTESTED_FILE.name
-    write_text(out / file_name, power.untested_text(keys))
+    write_text(out / file_name, power.untested_text(constants))
     for camera in cameras:
-        untested_keys = set(keys.get(camera, []))
-        stored_keys = set(stored.get(camera, []))
-        for key in sorted(untested_keys ^ stored_keys):
-            state = "untested" if key in untested_keys else "noticed"
+        words_now = constants.get(camera, {})
+        words_stored = stored.get(camera, {})
+        for key in sorted({*words_now, *words_stored}):
+            now = words_now.get(key)
+            if now == words_stored.get(key):
+                continue
+            state = "noticed" if now is None else f"untested (it changes: {now})"
             print(f"{camera}: {key} is {state} now", file=sys.stderr)
     print(
         f"the untested constants are not those of {file_name}: see {out / file_name}",
@@ -205,11 +208,9 @@ def _page(answer: str, card: Scorecard, provenance: dict[str, object], command: 
         body.append(FAMILIES.grid(card.families).html())
     if card.moved:
         body += [heading("Which figures notice a wrong constant"), note(POWER_NOTE)]
-        keys = power.untested(card.moved)
-        lines = [f"{camera_title(camera)}: {', '.join(names)}" for camera, names in keys.items()]
         body += [
-            paragraph("Untested constants, which nothing notices or which could not be moved:"),
-            bullets(lines),
+            paragraph("Untested constants, and what they change on which limits of damage hang:"),
+            bullets(_untested_lines(power.untested(card.moved))),
         ]
         body.append(fold("All constants", power.POWER.grid(card.moved).html()))
     if failing := [score for score in real if not score.passes]:
@@ -234,6 +235,27 @@ def _page(answer: str, card: Scorecard, provenance: dict[str, object], command: 
         body += [heading(title), tag("table", tag("tbody", *lines), kind="prov")]
     body += command_of(command)
     return page("Scorecard of the simulated cameras", answer, body, [note(HOW)])
+
+
+def _untested_lines(constants: power.UntestedConstants) -> list[str]:
+    """Return a line for each camera: the untested constants on which limits hang, with what they
+    change; then the others, and those that could not be moved."""
+    lines = []
+    for camera, words_by_key in constants.items():
+        hanging = []
+        others = []
+        for key, words in words_by_key.items():
+            if words in ("none", power.NOT_MOVED_WORDS):
+                others.append(key)
+            else:
+                hanging.append(f"{key} ({words})")
+        parts = []
+        if hanging:
+            parts.append(f"limits hang on {', '.join(hanging)}")
+        if others:
+            parts.append(f"none seen to hang on {', '.join(others)}")
+        lines.append(f"{camera_title(camera)}: {'; '.join(parts)}")
+    return lines
 
 
 def _draw(canvas: Canvas, scores: Sequence[scoring.Score]) -> None:

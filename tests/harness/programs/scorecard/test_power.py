@@ -100,8 +100,9 @@ def test_an_illegal_move_is_halved_until_it_is_legal() -> None:
     contrast = constant((0.87, 0.88, 0.96), key="modulation.contrast")
     assert contrast.moved(upwards=True) == pytest.approx((0.902625, 0.913, 0.996))
     assert contrast.moved(upwards=False) == pytest.approx((0.609, 0.616, 0.672))
-    # a window has an odd number of pixels
-    assert constant(5, key="engine.window_px").moved(upwards=True) is None
+    # a window has an odd number of pixels: 6 and 8 are illegal
+    assert constant(5, key="engine.window_px").moved(upwards=True) == 7
+    assert constant(5, key="engine.window_px").moved(upwards=False) == 3
     assert constant(128, key="converter.knee_units").moved(upwards=True) == 166
 
 
@@ -146,6 +147,7 @@ def moved_with(
         return readings
 
     monkeypatch.setattr(power, "measured", measured)
+    monkeypatch.setattr(power, "HINGES", ())
     path = folder / "figures.yaml"
     path.write_text(FIGURES)
     rows = power_of(read_figures(path), ["femto_bolt_nfov", AZURE], 1)
@@ -229,6 +231,35 @@ def test_a_small_change_across_a_limit_is_not_noticed(
     rows = moved_with(tmp_path, monkeypatch, values, unmoved=1.06)
     assert rows[f"{AZURE} photons.read_noise_electrons"].verdict == "untested"
     assert rows[f"{AZURE} photons.band_nm"].verdict == "noticed"
+
+
+def test_an_untested_constant_states_on_what_limits_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the untested ones, read noise and stray light change the noise at 0.7 m by 6 and 4 %; a
+    share of valid pixels counts by its difference."""
+
+    def measured(requests: Any, effort: Any, jobs: int) -> dict[Request, Reading]:
+        readings = {}
+        for request in requests:
+            keys = [key for key, _ in request.numbers]
+            value = 1.0
+            if request.conditions.to_data().get("distance_m") == 0.7:
+                value = {"photons.read_noise_electrons": 1.06, "scatter.blur_px": 1.04}.get(
+                    "".join(keys), 1.0
+                )
+            readings[request] = Reading(value)
+        return readings
+
+    monkeypatch.setattr(power, "measured", measured)
+    hinges = tuple(hinge for hinge in power.HINGES if hinge.words in ("noise", "missing returns"))
+    monkeypatch.setattr(power, "HINGES", hinges)
+    path = tmp_path / "figures.yaml"
+    path.write_text(FIGURES)
+    words = untested(power_of(read_figures(path), [AZURE], 1))[AZURE]
+    assert words["photons.read_noise_electrons"] == "noise, missing returns"
+    assert words["scatter.blur_px"] == "none"
+    assert words["scatter.stray_share"] == "not moved"
 
 
 def test_the_table_states_both_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -391,7 +391,9 @@ def test_power_compares_the_untested_constants_with_those_on_file(tmp_path, caps
     options = ["--jobs", "1", "--power", "--out", str(out)]
     assert main(options) == 1
     printed = capsys.readouterr()
-    assert f"{AZURE}: photons.read_noise_electrons is untested now" in printed.err
+    assert (
+        f"{AZURE}: photons.read_noise_electrons is untested (it changes: none) now" in printed.err
+    )
     assert "0 of " in printed.out
     stored.write_text((out / "untested.yaml").read_text())
     assert main(options) == 0
