@@ -100,7 +100,10 @@ class LearnedDetector(MatchedDetector):
         alone_before = before - LOBE_SHARE * cv2.dilate(behind, reach)
         strongest = np.maximum(alone_behind, alone_before)
         side = np.where(alone_behind >= alone_before, 1.0, -1.0)
-        signed = side * np.sqrt(2.0 * np.maximum(strongest, 0.0)) * whitened.known
+        strongest = np.maximum(strongest, 0.0)
+        # below one deviation in proportion: the root is too steep at 0 to repeat
+        score = np.where(strongest > 0.5, np.sqrt(2.0 * strongest), 2.0 * strongest)
+        signed = side * score * whitened.known
         deviation_m = float(np.median(whitened.unit_m[whitened.known]))
         unit = (
             "the root of twice the logarithm of a network's likelihood ratio; the noise of a pixel"
