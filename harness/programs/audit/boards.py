@@ -9,6 +9,7 @@ from harness import api
 from harness.evaluation.intervals import poisson_rate
 from harness.evaluation.study.limit import SetUpLimit
 from harness.programs.audit.rows import Audited, audited
+from harness.vocabulary.path_names import in_words
 
 WITHIN = 2.0  # standard errors
 NOMINAL = 0.954  # share of normal errors within two standard errors
@@ -18,11 +19,11 @@ def rows_of_study(folder: Path) -> list[Audited]:
     """Return the coverage of stated diameters, depths and rates, for each set-up."""
     holes = api.table(folder, "trials")
     rows: list[Audited] = []
-    for _, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
+    for _, of_set_up in holes.groupby(["variant", "frames"], sort=True):
         first = of_set_up.iloc[0]
         frames = int(first["frames"])
         plural = "" if frames == 1 else "s"
-        case = f"{first['variant']}, {first['kind']}, {frames} frame{plural}"
+        case = f"{in_words(str(first['variant']))}, {frames} frame{plural}"
         rows += _sizes(of_set_up, case)
     rows += _rates(api.limits(folder))
     return rows
