@@ -9,6 +9,7 @@ from harness import api
 from harness.evaluation.intervals import poisson_rate
 from harness.evaluation.study.limit import SetUpLimit
 from harness.programs.audit.rows import Audited, audited
+from harness.vocabulary.path_names import in_words
 from harness.vocabulary.text import many
 
 WITHIN = 2.0  # standard errors
@@ -19,9 +20,10 @@ def rows_of_study(folder: Path) -> list[Audited]:
     """Return the coverage of stated diameters, depths and rates, for each set-up."""
     holes = api.table(folder, "trials")
     rows: list[Audited] = []
-    for _, of_set_up in holes.groupby(["variant", "frames", "kind"], sort=True):
+    for _, of_set_up in holes.groupby(["variant", "frames"], sort=True):
         first = of_set_up.iloc[0]
-        case = f"{first['variant']}, {first['kind']}, {many(int(first['frames']), 'frame')}"
+        frames = many(int(first["frames"]), "frame")
+        case = f"{in_words(str(first['variant']))}, {frames}"
         rows += _sizes(of_set_up, case)
     rows += _rates(api.limits(folder))
     return rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from harness import api
 from harness.evaluation.intervals import Interval
+from harness.evaluation.study.limit import limit_of
 from harness.experiment.load import load_experiment
 from harness.programs.audit import boards, studies
 from harness.programs.audit.audit import BOARDS, main, rows_of_simulated
@@ -111,6 +113,24 @@ def test_sizes_count_where_model_and_error_are_known() -> None:
     assert (row.held, row.stated) == (1, 2)
     assert row.ratio == pytest.approx((10.0 / 10.9 + 1.2) / 2)
     assert row.quantity == "diameter, two standard errors"
+
+
+def test_counted_false_calls_agree_where_the_intervals_overlap() -> None:
+    """Garwood: 5 calls on 3.24 m2 are 0.50 to 3.60 per m2, 15 are 2.59 to 7.64."""
+    limits = []
+    for number in (5, 15):
+        claimed = studies._threshold(STUDY_CASES[1], np.random.default_rng(1))
+        record = studies._record(STUDY_CASES[1], claimed, np.random.default_rng(1))
+        assert record.threshold_error is not None
+        stated = replace(record.threshold_error, low_per_m2=0.4, high_per_m2=1.8)
+        calls = np.zeros(60, int)
+        calls[:number] = 1
+        unflawed = replace(record.unflawed, calls=calls)
+        limits.append(limit_of(replace(record, threshold_error=stated, unflawed=unflawed), draws=2))
+    given = limit_of(replace(limits[0].record, threshold_error=None), draws=2)
+    (row,) = boards._rates((*limits, given))
+    assert (row.held, row.stated) == (1, 2)
+    assert row.ratio == pytest.approx(10 / 3.24)
 
 
 def test_the_program_writes_page_and_table(
