@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from detectors.findings import whitening
+from detectors.pixels.masks import grown
 from detectors.pixels.noise import sigma_of
 from harness.vocabulary.geometry import Cloud
 
@@ -25,7 +26,7 @@ BLOCK_PX = 3
 """Pixels along the outline over whose mean the errors are measured, as wide as the narrowest
 filters: an edge's errors are alike along it, so that a mean does not reduce them."""
 FEWEST = 200  # pixels of a layer that determine its variance
-MOST_SIGMAS = 5.0  # limit to which values are clipped, so that damage does not spread
+LOUD_SIGMAS = 5.0  # values that do not count, nor those next to them: they are damage
 CLIP_SIGMAS = 2.5
 """Limit to which the errors of a layer are clipped, in their own deviations: damage on a tenth of
 the rim adds half of its variance."""
@@ -58,9 +59,9 @@ def rim_variances(
             mean over pictures of one camera it leaves 0.4 standard errors at most."""
     count = int(np.ceil(reach_px))
     layer = np.ceil(depth_px).astype(np.int64)
-    clipped = np.clip(values, -MOST_SIGMAS, MOST_SIGMAS).astype(np.float32)
-    at_rim = _layers(clipped, layer, noise, range(1, count + 1))
-    farther_in = _layers(clipped, layer, noise, range(count + 1, 2 * count + 1))
+    layer[grown(np.abs(values) > LOUD_SIGMAS, 2)] = 0
+    at_rim = _layers(values.astype(np.float32), layer, noise, range(1, count + 1))
+    farther_in = _layers(values.astype(np.float32), layer, noise, range(count + 1, 2 * count + 1))
     excess = at_rim - farther_in
     if is_alone:
         counts = np.bincount(layer.ravel(), minlength=2 * count + 1)[1:]
