@@ -50,8 +50,7 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     notes = limit_notes(result.limits)
     if notes:
         parts += ["", *notes]
-    headline = unknown_headline(result)
-    sentences = [sentence for sentence in unknown_sentences(result) if sentence != headline]
+    sentences = unknown_sentences(result)
     if sentences:
         parts += ["", *sentences]
     return [*parts, "", " ".join(_answers(result))]

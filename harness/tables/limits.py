@@ -338,7 +338,7 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
     answer = _answer(limits)
     if any(limit.over_units for limit in limits):
         return answer
-    if answer.startswith(("Of ", "None ")):
+    if answer.startswith(("Found ", "None ")):
         answer = answer[0].lower() + answer[1:]
     return f"{ONE_UNIT}: {answer}"
 
@@ -357,16 +357,13 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
         of_kind = [limit for limit in within if limit.record.inspected.limit_of == kind]
-        suffix = f" of {kind}" if len(kinds) > 1 else ""
-        smallest = _size_and_label(of_kind[0])
-        largest = _size_and_label(of_kind[-1])
-        spans.append(f"the smallest limit{suffix} (a90/95) is {smallest}, the largest {largest}")
-    answer = f"Of {count} set-ups, {'; '.join(spans)}"
+        prefix = f"a {kind} of " if len(kinds) > 1 else ""
+        spans.append(f"{prefix}{_size_and_label(of_kind[0])} to {_size_and_label(of_kind[-1])}")
+    answer = f"Found nine times out of ten (a90/95): {'; '.join(spans)}"
     without = count - len(within)
     if not without:
         return f"{answer}."
-    verb = "demonstrates" if without == 1 else "demonstrate"
-    return f"{answer}; {without} of {count} set-ups {verb} no limit within the sizes inspected."
+    return f"{answer}; in {without} of {count} set-ups no size inspected is."
 
 
 def _size_and_label(limit: SetUpLimit) -> str:

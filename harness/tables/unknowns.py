@@ -173,7 +173,7 @@ def unknown_sentences(result: StudyResult) -> list[str]:
 
 
 def unknown_headline(result: StudyResult) -> str:
-    """Return the sentence of the set-up with the smallest a90 over the unknowns; empty for a study
+    """Return the range of the set-up with the smallest a90 over the unknowns; empty for a study
     without unknowns."""
     drawn = [set_up for set_up in result.set_ups if set_up.unknowns]
     if not drawn:
@@ -182,35 +182,41 @@ def unknown_headline(result: StudyResult) -> str:
     def a90_or_infinity(set_up: SetUpResult) -> float:
         return float(np.nan_to_num(set_up.limit.a90_mm, nan=np.inf))
 
-    best = min(drawn, key=a90_or_infinity)
-    return _sentence(result, best)
+    return f"{_range_words(min(drawn, key=a90_or_infinity))}."
 
 
 def _sentence(result: StudyResult, set_up: SetUpResult) -> str:
-    """Return the sentence of a set-up that draws unknowns."""
+    """Return the sentence of a set-up that draws unknowns: its range, and a90 at the stated values
+    and over all boards."""
     limit = set_up.limit
-    unknowns = set_up.unknowns
-    assert unknowns is not None
-    label = limit.record.label.replace(f"{UNKNOWNS} drawn, ", "")
     stated = stated_of(result, limit)
     parts = [f"{_size(limit, limit.a90_mm)} over the unknowns (drawn for each board)"]
     if stated is not None:
         parts.insert(0, f"{_size(limit, stated.a90_mm)} at the stated values")
-    sizes = " and ".join(parts)
+    return f"{_range_words(set_up)}; {' and '.join(parts)}."
+
+
+def _range_words(set_up: SetUpResult) -> str:
+    """Return ``50 frames: a90 is 3.4 to 5.2 mm, depending on backing (most) and blur``, or why
+    there is no range."""
+    limit = set_up.limit
+    unknowns = set_up.unknowns
+    assert unknowns is not None
+    label = limit.record.label.replace(f"{UNKNOWNS} drawn, ", "")
+    over_unknowns = f"{label}: a90 is {_size(limit, limit.a90_mm)}"
     if unknowns.why:
-        return f"{label}: a90 is {sizes}; {unknowns.why}."
+        return f"{over_unknowns}; {unknowns.why}"
     names = unknown_names(unknowns.effects)
     deciding = [names[effect.unknown.key] for effect in unknowns.deciding]
     if not deciding:
         largest = unknowns.effects[0]
         factor = f"{names[largest.unknown.key]}, a factor of {largest.factor:.2f}"
-        return f"{label}: a90 is {sizes}; no unknown moves it beyond chance (at most {factor})."
+        return f"{over_unknowns}; no unknown moves it beyond chance (at most {factor})"
     if len(deciding) > 1:
         deciding[0] += " (most)"
     lowest = text.size(unknowns.lowest_mm, limit.largest_mm)
     ends = f"{lowest} to {_size(limit, unknowns.highest_mm)}"
-    causes = text.joined_words(deciding)
-    return f"{label}: a90 is {ends}, depending on {causes}; {sizes}."
+    return f"{label}: a90 is {ends}, depending on {text.joined_words(deciding)}"
 
 
 def _size(limit: SetUpLimit, size_mm: float) -> str:

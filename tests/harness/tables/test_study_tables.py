@@ -298,8 +298,8 @@ def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLi
     )
     deep = limit_of(replace(two[1].record, inspected=turned), draws=20)
     answer = study_answer([two[0], two[0], deep, deep])
-    assert "the smallest limit of diameter (a90/95) is" in answer
-    assert "; the smallest limit of depth (a90/95) is" in answer
+    assert "(a90/95): a diameter of " in answer
+    assert "; a depth of " in answer
     assert answer.endswith("mm (50 frames).")
 
 

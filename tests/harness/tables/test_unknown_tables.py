@@ -51,7 +51,7 @@ def test_a_row_for_each_value_largest_factor_first(result):
 def test_the_sentence_names_the_range_and_what_it_depends_on(result):
     unknowns = result.set_ups[1].unknowns
     (sentence,) = unknown_sentences(result)
-    assert sentence == unknown_headline(result)
+    assert sentence.startswith(unknown_headline(result).removesuffix("."))
     assert [effect.unknown.key for effect in unknowns.deciding] == [BACKING, BLUR]
     low = f"{unknowns.lowest_mm:#.2g}"
     high = f"{unknowns.highest_mm:#.2g}"
@@ -69,7 +69,7 @@ def test_a_sentence_without_effects():
     assert "no unknown moves it beyond chance (at most " in sentence
     few = result_with(drawn_set_up(boards=12))
     (sentence,) = unknown_sentences(few)
-    assert sentence.endswith("12 boards are too few to tell the unknowns apart; 15 are needed.")
+    assert "; 12 boards are too few to tell the unknowns apart; 15 are needed; " in sentence
 
 
 def test_a_study_without_unknowns_says_nothing_of_them():
