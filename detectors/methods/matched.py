@@ -264,8 +264,8 @@ def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     """Return the residuals (r, c) minus what they share, along some 65 pixels, with those at the
     same distance from the outline, beyond what those next to the rim share: subtracting a mean
     would leave a step there. What is subtracted fades inwards, so that it ends without a step, on
-    which smooth noise would be found to be damaged. Pixels whose ``depth_px`` (r, c) is 0 are
-    unknown."""
+    which smooth noise would be found to be damaged; in a picture that is mostly rim it does not,
+    as what it left would pass for noise. Pixels whose ``depth_px`` (r, c) is 0 are unknown."""
     noise = noise.astype(np.float32)
     rows = -(-noise.shape[0] // LAYER_PX)
     columns = -(-noise.shape[1] // LAYER_PX)
@@ -277,8 +277,15 @@ def _without_rim(noise: np.ndarray, depth_px: np.ndarray) -> np.ndarray:
     count = cv2.blur(count, (side, side), borderType=cv2.BORDER_CONSTANT)
     shared = total / np.maximum(count, 1e-6)
     shared -= shared[..., RIM_PX:]
-    _subtract_layers(noise, depth_px, shared)
+    fade = 1.0 / RIM_PX if _has_interior(depth_px) else 0.0
+    _subtract_layers(noise, depth_px, shared, fade)
     return noise
+
+
+def _has_interior(depth_px: np.ndarray) -> bool:
+    """Return whether most known pixels, whose ``depth_px`` (r, c) is above 0, lie inside the
+    rim."""
+    return bool(2 * np.count_nonzero(depth_px > RIM_PX) > np.count_nonzero(depth_px > 0))
 
 
 @numba.njit(**PLAIN)
@@ -304,22 +311,24 @@ def _subtract_layers(
     noise: np.ndarray,
     depth_px: np.ndarray,
     shared: np.ndarray,
+    fade: float,
 ) -> None:
     """Subtract from the rim's residuals what they share (r, c, `RIM_PX` + 1) in their square and
-    at their distance: all of it next to the outline, the less, the farther in."""
+    at their distance: all of it next to the outline, and ``fade`` of it less with each pixel
+    farther in."""
     for i in range(noise.shape[0]):
         for j in range(noise.shape[1]):
             if 0 < depth_px[i, j] <= RIM_PX:
                 layer = i // LAYER_PX, j // LAYER_PX, min(int(depth_px[i, j]) - 1, RIM_PX)
-                fading = 1.0 - (depth_px[i, j] - 1.0) / RIM_PX
-                noise[i, j] -= np.float32(fading * shared[layer])
+                kept = 1.0 - fade * (depth_px[i, j] - 1.0)
+                noise[i, j] -= np.float32(kept * shared[layer])
 
 
 def _covariance(residuals: _Residuals) -> np.ndarray:
     """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
-    inner = residuals.known & (residuals.depth_px > RIM_PX)
-    if 2 * inner.sum() <= residuals.known.sum():
-        inner = residuals.known
+    inner = residuals.known
+    if _has_interior(residuals.depth_px * residuals.known):
+        inner = residuals.known & (residuals.depth_px > RIM_PX)
     loud = (np.abs(residuals.values) > QUIET_SIGMAS).astype(np.uint8)
     quiet = inner & (cv2.dilate(loud, np.ones((5, 5), np.uint8)) == 0)
     grid = whitening.grid_of(residuals.values.shape)

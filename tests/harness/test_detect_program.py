@@ -354,15 +354,8 @@ def test_the_crop_decides_what_is_searched(
     assert len(rows_of(tmp_path / "out" / "findings.csv")) == found
 
 
-HALF_CUT = pytest.param(
-    plane.HOLE_U,
-    True,
-    marks=pytest.mark.xfail(reason="half a hole on the rim of 20 columns is taken for its errors"),
-)
-
-
 @pytest.mark.usefixtures("unpictured")
-@pytest.mark.parametrize(("left_u_px", "is_cut"), [(45, False), HALF_CUT])
+@pytest.mark.parametrize(("left_u_px", "is_cut"), [(45, False), (plane.HOLE_U, True)])
 def test_a_finding_that_the_crop_cuts_is_flagged_and_no_doubt_about_the_answer(
     capture: Path,
     tmp_path: Path,
