@@ -673,7 +673,8 @@ def _refined_slots(
 
 
 def _draw(best: _Best, slot: slots.BestSlot, number: int) -> None:
-    """Raise the scores along a slot, so that it is one finding with its peak in the middle."""
+    """Raise the scores along a slot, so that it is one finding with its peak in the middle. A slot
+    that reaches over stronger evidence has its own from there, and is left out."""
     half_px = slot.length_px / 2
     along = np.arange(-half_px, half_px + 0.5, 0.5)
     angle_rad = math.radians(slot.angle_deg)
@@ -685,6 +686,8 @@ def _draw(best: _Best, slot: slots.BestSlot, number: int) -> None:
     scores[len(along) // 2] = slot.score
     place = rows[inside], columns[inside]
     scores = scores[inside]
+    if np.abs(best.signed[place]).max(initial=0.0) > abs(slot.score):
+        return
     stronger = np.abs(scores) > np.abs(best.signed[place])
     best.signed[place] = np.where(stronger, scores, best.signed[place])
     best.template[place] = np.where(stronger, number, best.template[place])
