@@ -174,7 +174,8 @@ def threshold_of(point: Point, quiet: Iterable[QuietRun]) -> float | None:
         message = f"the detector {detector!r} gave no score to any pixel of the hole-free boards"
         raise UserError(message, fix="check its crop against the boards' poses")
     try:
-        peaks = [run.peaks for run in runs]
+        # a run without a finding has no peak, but a threshold above which it has none
+        peaks = [run.peaks or (run.threshold,) for run in runs]
         return threshold_from_peaks(peaks, area_m2, calibrate.false_calls_per_m2).value
     except UserError as error:
         board = point.config.simulated.target.declare().board

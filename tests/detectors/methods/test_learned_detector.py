@@ -114,7 +114,7 @@ def test_a_side_lobe_beside_stronger_evidence_is_no_finding(tmp_path):
         residual_m[30:33, 30 + distance : 33 + distance] = -7e-3
         noise_m = 1e-3 * np.random.default_rng(8).standard_normal((60, 60))
         known = np.ones((60, 60), np.float32)
-        signed, _, _ = detector.scored(residual_m + noise_m, known, (0.0, 0.0))
+        signed, _, _ = detector.scored(residual_m + noise_m, known, (0.0, 0.0), 1.0)
         scores[distance] = signed[31, 31 + distance]
         assert signed[31, 31] > 8.0
     assert scores[12] < -5.0

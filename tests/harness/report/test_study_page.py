@@ -179,7 +179,7 @@ def test_the_limits_stand_in_their_table(whole: StudyResult, page: str) -> None:
     best = min(whole.limits, key=lambda limit: limit.a90_95.value)
     answer = re.search(r'class="answer">(.*?)</p>', page)
     assert answer is not None
-    assert f"the smallest limit (a90/95) is {size(best.a90_95.value)}\u00a0mm" in answer[1]
+    assert f"(a90/95): {size(best.a90_95.value)}\u00a0mm" in answer[1]
     assert "within 15 mm of its own" in words(page)
 
 

@@ -88,7 +88,8 @@ def test_the_truth_of_a_row_is_that_of_the_board() -> None:
     assert (row.true_offset_mm, other.true_offset_mm) == pytest.approx((0.0, 60.0))
     assert row.seen_depth_mm == pytest.approx(10.0)
     assert (row.kind, row.size_of) == ("through", "diameter")
-    assert row.signal is None and row.no_return is None
+    assert row.signal == 9.0
+    assert row.no_return is None
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,8 @@ def test_a_damaged_board_gives_a_run_and_a_row_of_its_hole(inspected: TrialRecor
     assert (row.hole, row.detected, row.state, row.threshold) == ("7", True, "found", 6.0)
     assert row.origin == run.origin
     # a study's columns are absent elsewhere
-    assert run.inspected_m2 is None and row.signal is None and row.no_return is None
+    assert run.inspected_m2 is None and row.no_return is None
+    assert row.signal == row.score  # the finding's peak lies within the hit radius
     assert not inspected.findings and not inspected.probes and not inspected.noise
 
 
