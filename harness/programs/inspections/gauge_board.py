@@ -22,6 +22,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.geometry import MM, invert, transform_points
 from harness.vocabulary.provenance import check_version
+from harness.vocabulary.text import many
 
 GAUGE_VERSION = 1
 FEWEST_MARKS = 3
@@ -170,7 +171,7 @@ class GaugeSeen:
         """The counts as a sentence."""
         count = Counter(row.found for row in self.rows)
         hits = f"{count['hit']} hits, {count['miss']} misses, {count['NA']} holes not judged"
-        return f"gauge: {hits}, {self.false_calls} false calls"
+        return f"gauge: {hits}, {many(self.false_calls, 'false call')}"
 
 
 def seen_on(gauge: Gauge, judged: Judged, detector: str, threshold: float) -> GaugeSeen:

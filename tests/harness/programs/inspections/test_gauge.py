@@ -190,7 +190,8 @@ def test_a_capture_of_the_board_gives_hits_and_misses(
     assert gauge.main(["read", *arguments, "--out", str(tmp_path / "found")]) == 0
     printed = capsys.readouterr().out
     assert "4 marks" in printed
-    assert "0 false calls" in printed
+    # beside the deepest hole, a bump of half a millimetre
+    assert "gauge: 20 hits, 4 misses, 0 holes not judged, 1 false call\n" in printed
     lines = (tmp_path / "found" / "gauge.csv").read_text().splitlines()
     rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
     assert [row["target"] for row in rows] == [f"board-1:{n}" for n in range(1, 25)]

@@ -113,4 +113,4 @@ def test_a_hole_must_be_judged_on_all_sides() -> None:
 def test_the_answer_counts_holes_and_calls() -> None:
     rows, calls = matched(judged_with([(0.0, 0.0), (20.0, 50.0)]))
     seen = GaugeSeen(tuple(rows), calls, (), ())
-    assert seen.answer == "gauge: 1 hits, 3 misses, 0 holes not judged, 1 false calls"
+    assert seen.answer == "gauge: 1 hits, 3 misses, 0 holes not judged, 1 false call"
