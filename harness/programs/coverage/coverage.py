@@ -40,6 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
     add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--detector", metavar="NAME", help="the only detector, of an experiment that compares some")
     pose = (
         "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; "
         "may be repeated"
@@ -113,7 +114,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.files import write_text
     from scenes.render.cache import in_use
 
-    experiment = load_experiment(options.experiment, options.overrides).at_stated_values()
+    overrides = options.overrides
+    if options.detector:
+        overrides = [*overrides, f"sweep.detector.name=[{options.detector}]"]
+    experiment = load_experiment(options.experiment, overrides).at_stated_values()
     config = experiment.config
     size_mm = _wanted_mm(options, experiment)
     given_poses, further_poses = _poses(options, declared(config)[1].distance_m)
@@ -169,7 +173,7 @@ def _wanted_mm(options: argparse.Namespace, experiment: Experiment) -> float | N
                 f"{experiment.config.name}: has {set_ups} set-ups, but only --goal can compare "
                 "several"
             ),
-            fix="choose one set-up with --set, such as sweep={} and the values of its axes",
+            fix="choose one set-up: --detector NAME, or --set sweep={} and the values of its axes",
         )
     size_mm = None
     if options.goal:

@@ -200,11 +200,12 @@ def test_the_program_says_where_the_camera_is_blind(
     [
         (["plate", "--set", "sweep={}"], "is not a study of drawn damage"),
         (["detection_limit", "--size", "5mm"], "set-ups, but only --goal can compare several"),
-        (["pipe", "--set", ONE_DETECTOR, "--size", "5"], "not a length with a unit"),
+        (["pipe", "--detector", "thesi", "--size", "5mm"], "thesis"),
+        (["pipe", "--detector", "thesis", "--size", "5"], "not a length with a unit"),
         (["pipe", "--goal", "5mm", "--suggest", "2"], "leave out --size"),
-        (["pipe", "--set", ONE_DETECTOR, "--size", "99mm"], "inspects no damage of that size"),
+        (["pipe", "--detector", "thesis", "--size", "99mm"], "inspects no damage of that size"),
         (["pipe", "--goal", "99mm"], "inspects no damage of that size"),
-        (["pipe", "--set", ONE_DETECTOR, "--share", "2"], "a share above 0"),
+        (["pipe", "--detector", "thesis", "--share", "2"], "a share above 0"),
     ],
 )
 def test_mistakes_are_one_message(
