@@ -71,6 +71,19 @@ def own_lens() -> Lens:
     ).nominal_lens
 
 
+def implanted(
+    config: CameraConfig,
+    board: custom.TargetConfig,
+    lens: Lens,
+    *,
+    same_camera: bool,
+    frames: int,
+    cache: Path,
+) -> Implant:
+    """Return what the board's damage does to a recording with this lens, for one draw of noise."""
+    return implant_of(config, same_camera, lens, board, frames, 3, cache)
+
+
 def test_a_unit_keeps_what_a_recording_lacks() -> None:
     config, same = unit_config(CAMERA, own_lens())
     assert same
@@ -227,15 +240,7 @@ FACING = np.array([0.0, 0.0, -1.0])
 def test_the_difference_between_two_views(planes: dict, tmp_path: Path) -> None:
     config, same = unit_config(CAMERA, own_lens())
     board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
-    implant = implant_of(
-        config,
-        same,
-        own_lens(),
-        board,
-        10,
-        3,
-        tmp_path,
-    )
+    implant = implanted(config, board, own_lens(), same_camera=same, frames=10, cache=tmp_path)
     assert implant.noise_m.shape[0] == implants.LEAST_DRAWS
     changed = implant.shift_m != 0
     assert implant.shift_m[changed] == pytest.approx(3e-3, abs=2e-4)
@@ -254,27 +259,11 @@ def test_the_difference_between_two_views(planes: dict, tmp_path: Path) -> None:
     assert added > recorded
     assert (implant.noise_m[:, ~changed] == 0).all()
     planes[True] = planes[False]
-    none = implant_of(
-        config,
-        same,
-        own_lens(),
-        board,
-        10,
-        3,
-        tmp_path,
-    )
+    none = implanted(config, board, own_lens(), same_camera=same, frames=10, cache=tmp_path)
     assert np.abs(none.shift_m).max() == 0
     assert np.abs(none.noise_m).max() == 0
     planes[False] = (0.603, 0.2)
-    quiet = implant_of(
-        config,
-        same,
-        own_lens(),
-        board,
-        50,
-        3,
-        tmp_path,
-    )
+    quiet = implanted(config, board, own_lens(), same_camera=same, frames=50, cache=tmp_path)
     assert quiet.noise_m.shape[0] == 50
     assert np.abs(quiet.noise_m).max() == 0  # noise is never removed
     assert quiet.shift_m[quiet.shift_m != 0] == pytest.approx(-3e-3, abs=2e-4)
@@ -287,28 +276,14 @@ def test_what_the_camera_loses_before_the_damage_is_lost(
     config, same = unit_config(CAMERA, own_lens())
     board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
     planes[True] = (0.6, 0.0)
-    implant = implant_of(
-        config,
-        same,
-        own_lens(),
-        board,
-        10,
-        3,
-        tmp_path,
-    )
+    implant = implanted(config, board, own_lens(), same_camera=same, frames=10, cache=tmp_path)
     lens = own_lens()
     reach_px = 6.0 * MM / 0.6 * lens.fx + camera_of(config).optics.margin_px + 2
     assert implant.lost[0].sum() == pytest.approx(np.pi * reach_px**2, rel=0.05)
     planes[True] = (0.6, 0.6)
     planes[False] = (0.6, 0.0)
-    assert not implant_of(
-        config,
-        same,
-        own_lens(),
-        board,
-        10,
-        3,
-        tmp_path,
+    assert not implanted(
+        config, board, own_lens(), same_camera=same, frames=10, cache=tmp_path
     ).lost.any()
 
 
@@ -330,24 +305,8 @@ def test_a_recording_of_other_pixels_gets_the_difference_between_them(
     config, same = unit_config(CAMERA, larger)
     assert not same
     board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), PLACE_M, FACING)
-    fine = implant_of(
-        config,
-        same,
-        larger,
-        board,
-        10,
-        3,
-        tmp_path,
-    )
-    coarse = implant_of(
-        config,
-        True,
-        lens,
-        board,
-        10,
-        3,
-        tmp_path,
-    )
+    fine = implanted(config, board, larger, same_camera=same, frames=10, cache=tmp_path)
+    coarse = implanted(config, board, lens, same_camera=True, frames=10, cache=tmp_path)
     margin_px = camera_of(config).optics.margin_px
     side_px = 12.0 * MM / 0.6 * larger.fx + 2 * 2 * (margin_px + 2)
     assert fine.region.shape == pytest.approx((side_px, side_px), abs=2)
@@ -363,15 +322,7 @@ def test_damage_beside_the_cameras_view_is_refused(tmp_path: Path) -> None:
     aside_m = np.array([1.0, 0.0, 0.6])
     board = tangent_board(TARGET, TARGET.holes[0], part_face(FACING), aside_m, FACING)
     with pytest.raises(UserError, match="out of the camera's view"):
-        implant_of(
-            config,
-            same,
-            own_lens(),
-            board,
-            10,
-            3,
-            tmp_path,
-        )
+        implanted(config, board, own_lens(), same_camera=same, frames=10, cache=tmp_path)
 
 
 OFF_AXIS_MM = (0.0, 150.0)
@@ -414,15 +365,7 @@ def test_an_implant_is_as_deep_as_the_hole_in_the_whole_plate(x_mm: float, tmp_p
     half_m = np.array([0.25, 0.15])
     part = PartFace(T_camera_board, -half_m, half_m)
     board = tangent_board(plate, hole, part, place_m, FACING)
-    implant = implant_of(
-        config,
-        same,
-        lens,
-        board,
-        1,
-        3,
-        tmp_path,
-    )
+    implant = implanted(config, board, lens, same_camera=same, frames=1, cache=tmp_path)
     change_m = (z_m[0] - z_m[1])[implant.region.within(unit.region)]
     assert implant.depth_mm * MM == pytest.approx(np.nanmax(change_m), rel=0.03)
     assert implant.shift_m.sum() == pytest.approx(np.nansum(change_m), rel=0.03)
