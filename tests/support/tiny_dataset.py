@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.programs.dataset import dataset
 
-FAMILY = """\
+BOARDS = """\
 name: tiny
 seed: 3
 source:
@@ -22,8 +22,10 @@ source:
   camera: {name: azure_kinect_nfov}
   render: {bounces: 0}
 capture: {frames: 20}
-threshold: {calibrate: {boards: 2, false_calls_per_m2: 100.0}}
-study: {boards: 4, hole_free_boards: 1, units: 2}
+"""
+FAMILY = f"""\
+{BOARDS}threshold: {{calibrate: {{boards: 2, false_calls_per_m2: 100.0}}}}
+study: {{boards: 4, hole_free_boards: 1, units: 2}}
 """
 
 

@@ -21,26 +21,15 @@ from harness.programs.train.pictures import (
     prior_of,
 )
 from harness.runs.plan import plan_of
+from tests.support.tiny_dataset import BOARDS
 from tests.support.tiny_sweep import results, sweep
 
-FAMILY = """\
-name: tiny
-seed: 3
-source:
-  kind: simulated
-  target:
-    name: drawn
-    damage: {kind: through, per_board: 2, diameter_mm: [8.0, 14.0]}
-    board: {width_mm: 130, height_mm: 90, thickness_mm: 12.7}
-    room: null
-  camera: {name: azure_kinect_nfov}
-  render: {bounces: 0}
-capture: {frames: 20}
-detector:
+FAMILY = f"""\
+{BOARDS}detector:
   name: learned
-  settings: {crop: {kind: auto, inset_px: 4}}
-threshold: {calibrate: {boards: 2, false_calls_per_m2: 100.0}}
-study: {boards: 3, hole_free_boards: 1, units: 2}
+  settings: {{crop: {{kind: auto, inset_px: 4}}}}
+threshold: {{calibrate: {{boards: 2, false_calls_per_m2: 100.0}}}}
+study: {{boards: 3, hole_free_boards: 1, units: 2}}
 """
 
 
