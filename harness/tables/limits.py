@@ -363,7 +363,8 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     without = count - len(within)
     if not without:
         return f"{answer}."
-    return f"{answer}; in {without} of {count} set-ups no size inspected is."
+    verb = "demonstrates" if without == 1 else "demonstrate"
+    return f"{answer}; {without} of {count} set-ups {verb} no limit within the sizes inspected."
 
 
 def _size_and_label(limit: SetUpLimit) -> str:

@@ -90,7 +90,7 @@ def test_of_many_set_ups_the_span_and_those_without_a_limit(
     largest = f"{size(two[0].a90_95.value)} mm (1 frame)"
     assert answer == (
         f"One unit of the camera: found nine times out of ten (a90/95): {smallest} to {largest};"
-        " in 1 of 5 set-ups no size inspected is."
+        " 1 of 5 set-ups demonstrates no limit within the sizes inspected."
     )
     none = (
         "none of 4 set-ups demonstrates a limit (a90/95) within the sizes inspected (1 to 14 mm)."
