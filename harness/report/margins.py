@@ -35,17 +35,17 @@ def margin_figure(main: pd.DataFrame) -> str | None:
     """Draw the margins of the main set-up's holes (``main``: rows of `SUMMARY`): against the
     number of frames, with a panel for each size; against the size if there is one number of frames
     or there are more than `MOST_PANELS` sizes. Return SVG text; None if no margin was stored."""
-    known = main[main["margin_mean"] > 0]
-    if not len(known):
+    rows_with_margins = main[main["margin_mean"] > 0]
+    if not len(rows_with_margins):
         return None
-    sizes_mm = known["true_diameter_mm"].unique()
-    if known["frames"].nunique() > 1 and len(sizes_mm) <= MOST_PANELS:
-        return _by_frames(main, known)
-    return _by_size(known)
+    sizes_mm = rows_with_margins["true_diameter_mm"].unique()
+    if rows_with_margins["frames"].nunique() > 1 and len(sizes_mm) <= MOST_PANELS:
+        return _by_frames(main, rows_with_margins)
+    return _by_size(rows_with_margins)
 
 
-def _by_frames(main: pd.DataFrame, known: pd.DataFrame) -> str:
-    groups = list(known.groupby("true_diameter_mm"))
+def _by_frames(main: pd.DataFrame, rows_with_margins: pd.DataFrame) -> str:
+    groups = list(rows_with_margins.groupby("true_diameter_mm"))
     rows = -(-(len(groups) + 1) // ACROSS)
 
     def draw(figure: Figure) -> None:
@@ -54,7 +54,7 @@ def _by_frames(main: pd.DataFrame, known: pd.DataFrame) -> str:
             holes = ", ".join(group["hole"].unique()[:3])
             axes.set_title(f"no. {holes}: {size_mm:.1f} mm", fontsize=9)
             _draw_margins(axes, group.sort_values("frames"), "frames")
-            _margin_axis(axes, known)
+            _margin_axis(axes, rows_with_margins)
             axes.tick_params(labelsize=8)
         for axes in panels[: len(groups) : ACROSS]:
             axes.set_ylabel("score / threshold", fontsize=9)
@@ -62,7 +62,7 @@ def _by_frames(main: pd.DataFrame, known: pd.DataFrame) -> str:
         for axes in panels[len(groups) + 1 :]:
             axes.set_visible(False)
         panels[len(groups)].tick_params(labelsize=8)
-        _frames_axis(panels[0], known)
+        _frames_axis(panels[0], rows_with_margins)
         figure.supxlabel("frames averaged", fontsize=9)
 
     alt = (
@@ -72,12 +72,12 @@ def _by_frames(main: pd.DataFrame, known: pd.DataFrame) -> str:
     return blocks.svg("margins", (6.8, 1.55 * rows + 0.3), alt, draw)
 
 
-def _by_size(known: pd.DataFrame) -> str:
+def _by_size(rows_with_margins: pd.DataFrame) -> str:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        for _, group in known.groupby("frames"):
+        for _, group in rows_with_margins.groupby("frames"):
             _draw_margins(axes, group.sort_values("true_diameter_mm"), "true_diameter_mm")
-        _margin_axis(axes, known)
+        _margin_axis(axes, rows_with_margins)
         axes.set(xlabel="true diameter (mm)", ylabel="score / threshold")
 
     return blocks.svg(
@@ -98,10 +98,10 @@ def _draw_margins(axes: Axes, group: pd.DataFrame, column: str) -> None:
     axes.scatter(places, mean, c=colours, s=16, zorder=3)
 
 
-def _margin_axis(axes: Axes, known: pd.DataFrame) -> None:
+def _margin_axis(axes: Axes, rows_with_margins: pd.DataFrame) -> None:
     """Give an axis of margins the ends that hold all of them."""
-    lowest = max(min(known["margin_lowest"].min(), 1) / ROOM, LABELLED[0])
-    highest = max(known["margin_highest"].max(), 1) * ROOM
+    lowest = max(min(rows_with_margins["margin_lowest"].min(), 1) / ROOM, LABELLED[0])
+    highest = max(rows_with_margins["margin_highest"].max(), 1) * ROOM
     axes.set_yscale("log")
     axes.set_ylim(lowest, highest)
     ticks = [tick for tick in LABELLED if lowest <= tick <= highest]
@@ -109,9 +109,9 @@ def _margin_axis(axes: Axes, known: pd.DataFrame) -> None:
     axes.minorticks_off()
 
 
-def _frames_axis(axes: Axes, known: pd.DataFrame) -> None:
+def _frames_axis(axes: Axes, table: pd.DataFrame) -> None:
     """Give an axis of frames a logarithmic scale with a tick at each number."""
-    frames = sorted(known["frames"].unique())
+    frames = sorted(table["frames"].unique())
     axes.set_xscale("log")
     axes.set_xticks(frames, [f"{n:g}" for n in frames])
     axes.minorticks_off()

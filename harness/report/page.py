@@ -132,8 +132,8 @@ def answer_sentence(main: pd.DataFrame) -> str:
     if len(frames) == 1:
         return f"With {averaged_text(frames[0])} the camera finds {with_most}."
     if with_fewest == with_most:
-        few_and_many = f"{averaged_text(frames[0])} and with {frames[-1]}"
-        return f"With {few_and_many} the camera finds the same: {with_most}."
+        both_numbers = f"{averaged_text(frames[0])} and with {frames[-1]}"
+        return f"With {both_numbers} the camera finds the same: {with_most}."
     return (
         f"With {averaged_text(frames[-1])} the camera finds {with_most};"
         f" with {averaged_text(frames[0])}, {with_fewest}."
