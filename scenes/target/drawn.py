@@ -385,7 +385,11 @@ class DrawnTargetConfig(Config):
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme
         # poses
         backing_z_m = float(backing_corners_board_m(config, self.backing)[0, 2])
-        size_mm = _backing_size_mm(self, backing_z_m)
+        # its material casts no shadow; where it is unknown, each board has another
+        unpainted = self.model_copy(
+            update={"material": custom.ReflectanceConfig(), "backing": None}
+        )
+        size_mm = _backing_size_mm(unpainted, backing_z_m)
         backing = self.backing.model_copy(update={"size_mm": size_mm})
         return config.model_copy(update={"backing": backing})
 
