@@ -165,7 +165,6 @@ SMALL = {
     "anatomy": (
         "repeats=2",
         "threshold.calibrate.repeats=2",
-        "capture.exact=false",
         "sweep={capture.frames: [1]}",
     ),
     "perspectives": (*SMALL_REPEATS, "capture.frames=5", "sweep={mapping.views: [1, 2]}"),

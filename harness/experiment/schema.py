@@ -96,11 +96,6 @@ class CaptureConfig(Config):
         None,
         description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
-    exact: bool = Field(
-        False,
-        description="true simulates each frame; "
-        "false draws the mean if its distribution is the same",
-    )
 
 
 class DetectorConfig(Config):

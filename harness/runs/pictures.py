@@ -49,10 +49,7 @@ def _seen_again(trial: Trial, point: TrialPoint, most: int) -> LabelledCloud:
     """Return the cloud of one view like a trial that drew ``most`` frames."""
     board = load_board(trial.views[0])
     capture = capture_of(trial, 0, board, most)
-    averaging = point.averaging
-    clouds = averages_of(
-        capture, [point.frames], averaging.config, averaging.exact, averaging.flat_field
-    )
+    clouds = averages_of(capture, [point.frames], point.averaging)
     return board.labelled(clouds[point.frames])
 
 
@@ -158,9 +155,7 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
     averages = []
     for number, board in enumerate(boards):
         capture = capture_of(trial, number, board, most)
-        averages.append(
-            averages_of(capture, [most], averaging.config, averaging.exact, averaging.flat_field)
-        )
+        averages.append(averages_of(capture, [most], averaging))
     maps = clouds_of(trial, boards, averages)
     assert isinstance(maps, MapClouds)  # the group has several views
     examples = []

@@ -284,9 +284,7 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
         digest=point.digest,
         variant=point.variant,
         frames=config.capture.frames,
-        averaging=Averaging(
-            config.capture.average, config.capture.exact, config.capture.flat_field
-        ),
+        averaging=Averaging(config.capture.average, config.capture.flat_field),
         criteria=Criteria(
             detector=config.detector.name,
             settings_json=canonical_json(config.detector.settings),

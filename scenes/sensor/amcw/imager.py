@@ -336,7 +336,17 @@ class AmcwImager(UnitModel[AmcwCamera]):
         displaces the frame."""
         unit, amplitude, saturated = self.phasors(exposure, rng)
         filtered, edge = self.filter(unit, amplitude, exposure.shape)
-        return self._decode(filtered, edge, saturated, error_m)
+        n_frequencies = len(filtered)
+        shape = exposure.shape
+        decoded = self.decode(
+            filtered.reshape(n_frequencies, 3, -1),
+            edge.reshape(n_frequencies, -1),
+            saturated,
+            self.engine,
+            self._neighbours,
+            error_m,
+        )
+        return DecodedFrame(*(values.reshape(shape) for values in decoded))
 
     def phasors(
         self, exposure: AmcwExposure, rng: np.random.Generator
@@ -374,36 +384,46 @@ class AmcwImager(UnitModel[AmcwCamera]):
             kernels.filter_image(planes, strength, self.filter_settings, filtered[f], edge[f])
         return filtered, edge
 
-    def _decode(
-        self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float
+    def decode(
+        self,
+        filtered: np.ndarray,
+        edge: np.ndarray,
+        saturated: np.ndarray,
+        engine: ranging.DepthEngine,
+        neighbours: np.ndarray,
+        error_m: float,
     ) -> DecodedFrame:
-        """Unwrap, correct, gate and round: the remaining steps of the depth engine."""
-        n_frequencies = len(filtered)
-        shape = edge.shape[1:]
+        """Unwrap, correct, gate and round: the remaining steps of the depth engine.
+
+        Args:
+            filtered: (f, 3, n) float32, real and imaginary part and amplitude.
+            edge: (f, n) float32, edge sums.
+            saturated: (n,) uint8.
+            engine: the engine of these pixels.
+            neighbours: (n, 9) int32, indices of each pixel's neighbours and itself, -1 for none.
+            error_m: displacement of the frame.
+
+        Returns:
+            A frame of n pixels (n,).
+        """
         n = saturated.size
-        flying_gate = self.engine.flying
         z_m, reason, total = ranging.ranges_of(
-            filtered.reshape(n_frequencies, 3, -1),
-            edge.reshape(n_frequencies, -1),
-            saturated,
-            self.engine,
-            np.full(n, error_m),
+            filtered, edge, saturated, engine, np.full(n, error_m)
         )
-        if flying_gate is not None:
+        if engine.flying is not None:
             flying = np.empty((n, 1), bool)
             ranging.find_flying(
                 z_m[:, None],
                 total[:, None],
                 reason[:, None],
                 np.arange(n),
-                self._neighbours,
-                flying_gate,
+                neighbours,
+                engine.flying,
                 flying,
             )
             reason[flying[:, 0]] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
-        amplitude = total.reshape(shape) / f4(n_frequencies)
-        return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude)
+        return DecodedFrame(z_m, reason, total / f4(len(filtered)))
 
     @cached_property
     def _neighbours(self) -> np.ndarray:
