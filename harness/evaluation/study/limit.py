@@ -241,11 +241,17 @@ def _sizes_of_curve(
             excess=excess,
         )
     (a90_draws_mm,) = np.maximum(refitted_sizes(rows, statement.curve, (POD,), draws), 0.0)
-    over_boards, effect = _over_boards(statement, targets)
+    effect = _effect_of_boards(statement, targets, POD)
+    average_of_boards = _averaged(statement, effect)
+    over_boards = average_of_boards.bound(POD)
     margin = ONE_SIDED * size_per_error(rows, statement.curve, POD)
     over_boards = _with_margin(over_boards, statement.a90, margin)
     units: OverUnits | None = None
+    average_of_a50 = _averaged(statement, _effect_of_boards(statement, targets, 0.5))
+    average_of_a90 = average_of_boards
     if record.units > 1:
+        average_of_a50 = _with_units(average_of_a50, rows, 0.5)
+        average_of_a90 = _with_units(average_of_a90, rows, POD)
         units = over_units(
             size_mm=inspected.size_mm,
             hit=inspected.hit,
@@ -261,23 +267,20 @@ def _sizes_of_curve(
         a90_mm=statement.a90,
         a90_draws_mm=a90_draws_mm,
         over_boards=over_boards,
-        a50_interval_mm=_interval(statement, targets, rows, 0.5),
-        a90_interval_mm=_interval(statement, targets, rows, POD),
+        a50_interval_mm=_interval(average_of_a50, rows, 0.5),
+        a90_interval_mm=_interval(average_of_a90, rows, POD),
         design_effect=effect,
         over_units=units,
     )
 
 
-def _interval(statement: PodStatement, targets: Targets, rows: Targets, pod: float) -> Interval:
-    """Return the 95 % interval of the size with this POD: that of the averaged models with the
-    effects of boards and units, joined with the threshold's as in `_with_margin`."""
-    effect = 1.0
-    if statement.fits[0].method == "ML":
-        effect = max(design_effect(targets, statement.curve, pod), 1.0)
-        effect *= units_effect(rows, statement.curve, pod)
-    interval = ModelAverage(statement.fits, effect).interval(pod)
-    estimate = statement.curve.size_at(pod)
-    margin = TWO_SIDED * size_per_error(rows, statement.curve, pod)
+def _interval(average: ModelAverage, rows: Targets, pod: float) -> Interval:
+    """Return the average's 95 % interval of the size with this POD, joined with the threshold's
+    as in `_with_margin`."""
+    curve = average.fits[0].curve
+    interval = average.interval(pod)
+    estimate = curve.size_at(pod)
+    margin = TWO_SIDED * size_per_error(rows, curve, pod)
     if not margin or not interval.low > 0:
         return Interval(max(interval.low, 0.0), max(interval.high, 0.0))
     below = np.hypot(np.log(estimate / interval.low), margin)
@@ -309,15 +312,28 @@ def _with_margin(bound: Bound, a90: float, margin: float) -> Bound:
     return replace(bound, value=a90 * float(np.exp(np.hypot(of_hits, margin))))
 
 
-def _over_boards(statement: PodStatement, targets: Targets) -> tuple[Bound, float]:
-    """Return a90/95 with the curve's design effect, which divides the log-likelihoods, and that
-    effect; one below 1 counts as 1. Separated data have none."""
+def _effect_of_boards(statement: PodStatement, targets: Targets, pod: float) -> float:
+    """Return the curve's design effect at the size with this POD; NaN for separated data."""
     if statement.fits[0].method != "ML":
-        return statement.bound, np.nan
-    effect = design_effect(targets, statement.curve, POD)
-    if effect > 1:
-        return ModelAverage(statement.fits, effect).bound(POD), effect
-    return statement.bound, effect
+        return np.nan
+    return design_effect(targets, statement.curve, pod)
+
+
+def _averaged(statement: PodStatement, effect: float) -> ModelAverage:
+    """Return the average over the models with this design effect, which divides the
+    log-likelihoods; one below 1 counts as 1, as does NaN."""
+    if statement.average is not None and not effect > 1:
+        return statement.average
+    return ModelAverage(statement.fits, effect)
+
+
+def _with_units(average: ModelAverage, rows: Targets, pod: float) -> ModelAverage:
+    """Return the average with the effect of units at this POD; separated data have none."""
+    first = average.fits[0]
+    if first.method != "ML":
+        return average
+    effect = average.design_effect * units_effect(rows, first.curve, pod)
+    return replace(average, design_effect=effect)
 
 
 def _sizes_if_all_found(targets: Targets, draws: int) -> _Sizes:
