@@ -9,11 +9,13 @@ and scale, these are the weights whose quantiles cover as stated: Datta and Ghos
 1357.) The spacing matters where hits and misses do not overlap: such data do not bound a curve's
 steepness. The bound is the size at which the weight of curves with a larger a90 falls to a tail.
 
-The tail is calibrated (C): by the number of targets, it is the largest with which the bound
-covers the true a90 in at least 97 % of simulated studies on average over 20 curves, steep and
-flat, and in 90 % for every curve (``tests/validation/pod_levels.py``, which also measures curves
-and sizes that set nothing). Not modelled: a curve with floor or ceiling; a width above the range
-of the sizes is covered less often."""
+The tail of the bound is calibrated (C): by the number of targets, it is the largest with which the
+bound covers the true a90 in at least 97 % of simulated studies on average over 20 curves, steep
+and flat, and in 90 % for every curve (``tests/validation/pod_levels.py``, which also measures
+curves and sizes that set nothing). An interval leaves the weight `END` (C) beyond each of its ends,
+each of which covers 97 % on average over these curves and numbers of targets (``--ends``). Not
+modelled: a curve with floor or ceiling; a width above the range of the sizes is covered less
+often."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
+from harness.evaluation.intervals import Interval
 from harness.evaluation.pod.curve import CELLS, Bound, link_cdf, link_ppf
 from harness.evaluation.pod.hit_miss import HitMissFit, criterion
 
@@ -39,6 +42,8 @@ TAILS = {
     100: 0.02,
 }
 """Tail by number of targets; in between, linear in the logarithm of the number."""
+END = 0.02
+"""Weight beyond each end of an interval."""
 MIDDLES = 40
 WIDTHS = 32
 ZOOMS = 5  # most grids, each narrowed to the curves that matter in the one before
@@ -137,6 +142,17 @@ class ModelAverage:
         value = weighted_quantile(sizes, self.curves.weight, 1.0 - self.tail)
         value = max(value, self.fits[0].curve.size_at(pod))
         return Bound(pod, CONFIDENCE, METHOD, value)
+
+    def interval(self, pod: float) -> Interval:
+        """Return the central 95 % interval of the size with this POD, which contains that of the
+        first model's curve; without an upper end where a constant probability is not rejected."""
+        sizes = self.curves.sizes_at(pod)
+        low = weighted_quantile(sizes, self.curves.weight, END)
+        high = weighted_quantile(sizes, self.curves.weight, 1.0 - END)
+        if self._constant():
+            high = float("inf")
+        estimate = self.fits[0].curve.size_at(pod)
+        return Interval(min(low, estimate), max(high, estimate))
 
     def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: a curve's

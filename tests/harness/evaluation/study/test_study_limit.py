@@ -427,6 +427,16 @@ class TestBoardsDrawnAgain:
         assert calm.design_effect <= 1
         assert calm.over_boards.value == pytest.approx(calm.a90_95.value, rel=0.02)
 
+    def test_intervals_divide_the_log_likelihoods_by_the_effects_of_their_sizes(self):
+        limit = limit_of(set_up(Study((SetUp(boards_mm=3.0),), boards=30)), draws=20)
+        inspected = limit.record.inspected
+        targets = targets_of(inspected.board, inspected.hole, inspected.diameter_mm, inspected.hit)
+        curve = limit.statement.curve
+        for pod, interval in ((0.5, limit.a50_interval_mm), (0.9, limit.a90_interval_mm)):
+            effect = design_effect(targets, curve, pod)
+            assert effect > 1.3
+            assert interval == ModelAverage(limit.statement.fits, effect).interval(pod)
+
     def test_all_found_counts_one_damage_a_board(self):
         record = set_up(Study(boards=30, hole_free_boards=0))
         limit = limit_of(with_hits(record, np.ones(240, bool)))
