@@ -50,6 +50,8 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     notes = limit_notes(result.limits)
     if notes:
         parts += ["", *notes]
+    if result.record.designs:
+        parts += ["", *(design.sentence for design in result.record.designs)]
     sentences = unknown_sentences(result)
     if sentences:
         parts += ["", *sentences]

@@ -109,8 +109,11 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     stored_records = len(Journal(folder / "journal"))
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {points}, {many(len(plan.groups), 'set')} of frames")
-    print(f"  renders: {len(renders)}, {sum(path.exists() for path in renders)} of them cached")
-    print(f"  trials: {trials}")
+    study = experiment.config.study
+    most = " at most" if study is not None and study.precision is not None else ""
+    cached = sum(path.exists() for path in renders)
+    print(f"  renders: {len(renders)}{most}, {cached} of them cached")
+    print(f"  trials: {trials}{most}")
     if stored_records:
         print(
             f"  the journal holds {many(stored_records, 'trial')}; those of the same code "

@@ -128,6 +128,16 @@ class Outcome:
     trials: StageCounts = field(default_factory=StageCounts)
     peak_mb: float = 0.0
 
+    def counted_after(self, earlier: Outcome) -> Outcome:
+        """Return this outcome; what the same command did in an earlier batch counts as done, not
+        as found."""
+        for counts, before in ((self.renders, earlier.renders), (self.trials, earlier.trials)):
+            counts.done += before.done
+            counts.found -= before.done
+            counts.seconds += before.seconds
+        self.peak_mb = max(self.peak_mb, earlier.peak_mb)
+        return self
+
 
 @dataclass(frozen=True)
 class Limits:

@@ -4,7 +4,6 @@ import datetime
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,8 @@ from harness.runs.jobs import STATES, Job, JobEngine, Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
 from harness.runs.pictures import shown_in, study_examples
-from harness.runs.plan import SweepPlan, plan_of
+from harness.runs.plan import SweepPlan
+from harness.runs.precision import Batches, refuse_shard
 from harness.runs.results_folder import point_to
 from harness.runs.run import run_plan
 from harness.runs.shards import Shard, locked
@@ -65,33 +65,39 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     folder = experiment.folder(out)
     cache = out / ".cache" / "renders"
     _refuse_newer(folder)
+    refuse_shard(experiment, options.shard)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
+        journal = Journal(folder / "journal")
         # absolute paths: other processes may have started in another folder
-        plan = plan_of(experiment, cache.absolute(), folder.absolute())
+        batches = Batches(experiment, journal, cache.absolute(), folder.absolute())
+        plan = batches.first()
         # the first file written shows whether the folder is writable, before any work
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
-        journal = Journal(folder / "journal")
         with (
             in_use(cache),
             locked(folder, options.shard),
             engine_of(options, detectors, cache) as engine,
         ):
             with progress_display() as report:
-                outcome = run_plan(
-                    plan,
-                    journal,
-                    engine,
-                    report,
+                run = partial(
+                    run_plan,
+                    journal=journal,
+                    engine=engine,
+                    report=report,
                     shard=options.shard,
                     retry_failed=options.retry_failed,
                 )
+                outcome = run(plan)
+                while following := batches.after(plan, outcome, engine):
+                    plan = following
+                    outcome = run(plan).counted_after(outcome)
             if not options.shard.is_whole:
                 return _shard_over(options.shard, outcome, folder)
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
             print("writing tables and report", file=sys.stderr)
-            tables = tables_of(_records(journal, outcome), experiment)
+            tables = tables_of(journal.records(outcome.finished), experiment)
             provenance = _provenance(experiment, plan, outcome, tables, origin)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
             write_tables(folder, tables.stored(), provenance)
@@ -135,20 +141,6 @@ def _refuse_newer(folder: Path) -> None:
         return
     if type(version) is int and version > RESULTS_VERSION:
         check_version(version, RESULTS_VERSION, folder / PROVENANCE.name, "a result folder")
-
-
-def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
-    """Yield the records of all finished trials in the order of their keys; reading them one by one
-    saves memory."""
-    for key in outcome.finished:
-        entry = journal.read(key)
-        if entry is None or entry.record is None:
-            fix = "run the same command again: what is missing is run again"
-            raise UserError(
-                f"{journal.folder}: the record {key} is gone or damaged since it was written",
-                fix=fix,
-            )
-        yield entry.record
 
 
 def _write_study(

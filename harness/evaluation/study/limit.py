@@ -65,7 +65,7 @@ class SetUpLimit:
     """Reason why there is no curve; empty if there is one."""
     a90_95: Bound
     """The limit to quote, of diameters or depths in mm (`Inspected.limit_of`); infinite if not
-    demonstrated."""
+    demonstrated. Of a study whose sizes were chosen, it is ``over_boards``."""
     a50_mm: float
     """Size found 50 % of the time."""
     a90_mm: float
@@ -162,7 +162,8 @@ def limit_of(
         record=record,
         statement=sizes.statement,
         why=why,
-        a90_95=sizes.a90_95,
+        # chosen sizes bring more damages of each board to where POD rises, all with its own shift
+        a90_95=sizes.over_boards if record.sizes_chosen else sizes.a90_95,
         a50_mm=sizes.a50_mm,
         a90_mm=sizes.a90_mm,
         a90_draws_mm=sizes.a90_draws_mm,
