@@ -1,0 +1,240 @@
+"""What changed between an earlier capture of a part and this one: distances with their level of
+detection, and damage that is new, grown, shrunk or gone, with its size then and now.
+
+Findings are places where the part departs from the earlier capture. Its size then, and its size
+now, are those of the damage that each capture shows there by itself, against a smooth surface."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from detectors.pixels.noise import median_of
+from detectors.surfaces.change import Distances, distances
+from detectors.surfaces.scans import Scan
+from detectors.views.registration.registered import local_normals
+from harness.report.findings import Finding, Judged
+from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
+
+CYLINDER_POINTS = 20
+"""Typical number of points in a cylinder, as Lague et al. recommend."""
+REACH_M = 50 * MM
+"""Half of a cylinder's length: a change that is deeper is not measured."""
+CORES = 2000
+"""Number of core points over the part."""
+NORMAL_POINTS = 40
+"""Points whose plane gives a normal: over a neighbourhood of twice a cylinder's area."""
+NEW = "new"
+GROWN = "grown"
+SHRUNK = "shrunk"
+GONE = "gone"
+STATES = (NEW, GROWN, SHRUNK, GONE)
+
+
+@dataclass(frozen=True)
+class Size:
+    """The size of a damage in one capture."""
+
+    diameter_mm: float
+    depth_mm: float
+    """Normal to the surface, negative for a bump."""
+    depth_se_mm: float
+
+    @classmethod
+    def of(cls, finding: Finding) -> Size:
+        """Return the size of a finding."""
+        return cls(finding.diameter_mm, finding.depth_mm, finding.depth_se_mm)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A finding that is a change."""
+
+    id: int
+    """Its number among the findings."""
+    state: str
+    """One of `STATES`."""
+    then: Size | None
+    """Its size in the earlier capture; None if that shows no damage there."""
+    now: Size | None
+    """Its size in this capture."""
+    distance_mm: float
+    """Distance between both captures at its centre, + behind; NaN if not measured."""
+    lod_mm: float
+    """Level of detection of that distance at 95 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """All that changed."""
+
+    damage: tuple[Change, ...]
+    """One for each finding with a place on the part, in order."""
+    cores_m: np.ndarray
+    """(n, 3): core points, frame of this capture."""
+    distances: Distances
+    """Distances at the core points, and then at the findings."""
+    radius_m: float
+    """Radius of the cylinders."""
+
+    @property
+    def lod_mm(self) -> float:
+        """The level of detection at a typical point; NaN if none was measured."""
+        lods_m = self.distances.lod_m[: len(self.cores_m)]
+        known = lods_m[np.isfinite(lods_m)]
+        return median_of(known) / MM if len(known) else math.nan
+
+    @property
+    def sentence(self) -> str:
+        """Return ``1 damage new, 2 grown``, with the level of detection."""
+        counts = []
+        for state in STATES:
+            count = sum(change.state == state for change in self.damage)
+            if count:
+                counts.append(f"{count} {state}")
+        found = ", ".join(counts) or "no damage is new, grown, shrunk or gone"
+        typical = f"{self.lod_mm:.2g} mm at a typical place (95 %)"
+        return f"{found}; changes over {2 * self.radius_m / MM:.2g} mm are detected from {typical}"
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Return it as plain data, for the JSON."""
+        scale = 1.0 / MM
+        return {
+            "damage": [asdict(change) for change in self.damage],
+            "cylinder_radius_mm": self.radius_m * scale,
+            "typical_level_of_detection_mm": self.lod_mm,
+            "unexplained_mm": self.distances.common_m * scale,
+        }
+
+    @property
+    def csv_text(self) -> str:
+        """Return place, distance, level of detection and verdict of each core point, as CSV."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(("x_mm", "y_mm", "z_mm", "distance_mm", "lod_mm", "significant"))
+        count = len(self.cores_m)
+        lods_m = self.distances.lod_m[:count]
+        significant = self.distances.is_significant[:count]
+        for number in np.flatnonzero(np.isfinite(lods_m)):
+            place = [f"{value:.2f}" for value in self.cores_m[number] / MM]
+            sizes_m = (self.distances.distance_m[number], lods_m[number])
+            sizes = [f"{value / MM:.4f}" for value in sizes_m]
+            writer.writerow((*place, *sizes, int(significant[number])))
+        return stream.getvalue()
+
+
+def changes_of(result: Judged, earlier: Scan, then: Judged, now: Judged) -> Changes:
+    """Compare a capture with an earlier one. ``result``: judged against it; ``then`` and ``now``:
+    the earlier and this capture, each judged by itself."""
+    cloud = result.cloud
+    assert cloud.expected is not None
+    T_reference_camera = np.array(cloud.expected.facts["T_reference_camera"])
+    earlier_m = transform_points(invert(T_reference_camera), earlier.points_m)
+    judged = np.isfinite(result.evidence.residual_m) & cloud.valid
+    later_m = cloud.points_m[judged]
+    on_surface_m = _on_reference(cloud, later_m)
+    cores_m = on_surface_m[:: max(1, len(on_surface_m) // CORES)]
+    centres_m = _centres(result)
+    radius_m = math.sqrt(CYLINDER_POINTS / math.pi) * earlier.pitch_m
+    places_m = np.concatenate([cores_m, _on_reference(cloud, centres_m)])
+    _, near = cKDTree(earlier_m).query(np.nan_to_num(places_m), k=NORMAL_POINTS)
+    normals = local_normals(earlier_m[near])
+    # out of the camera, so that a deeper place has a positive distance
+    normals[(normals * np.nan_to_num(places_m)).sum(axis=1) < 0] *= -1.0
+    measured = distances(
+        earlier_m,
+        later_m,
+        cores_m=np.nan_to_num(places_m, nan=-1e3),
+        normals=normals,
+        radius_m=radius_m,
+        reach_m=REACH_M,
+        registration_m=cloud.expected.registration_at(places_m),
+        shared=(earlier.share_px, max(cloud.noise_reach_px, 1.0) ** 2),
+    )
+    damage = []
+    for number, finding in enumerate(result.findings):
+        index = len(cores_m) + number
+        size_then = _size_at(finding, then.findings, T_reference_camera)
+        size_now = _size_at(finding, now.findings, np.eye(4))
+        damage.append(
+            _change(
+                finding,
+                size_then,
+                size_now,
+                distance_m=float(measured.distance_m[index]),
+                lod_m=float(measured.lod_m[index]),
+            )
+        )
+    return Changes(tuple(damage), cores_m, measured, radius_m)
+
+
+def _on_reference(cloud: Cloud, points_m: np.ndarray) -> np.ndarray:
+    """Return where the rays through points (n, 3) meet the reference; NaN where they do not."""
+    assert cloud.expected is not None
+    z_m = cloud.expected.z_at(points_m)
+    if cloud.projection == "central":
+        return np.asarray(points_m * (z_m / points_m[:, 2])[:, None])
+    return np.column_stack([points_m[:, :2], z_m])
+
+
+def _centres(result: Judged) -> np.ndarray:
+    """Return the centres (n, 3) of the findings, metres."""
+    centres_mm = [(finding.x_mm, finding.y_mm, finding.z_mm) for finding in result.findings]
+    return np.array(centres_mm).reshape(-1, 3) * MM
+
+
+def _size_at(
+    change: Finding, damage: Sequence[Finding], T_damage_change: np.ndarray
+) -> Size | None:
+    """Return the size of the largest damage that covers the place of a change: their outlines
+    meet. ``T_damage_change`` (4, 4): from the change's frame."""
+    place_mm = np.array([change.x_mm, change.y_mm, change.z_mm])
+    place_mm = transform_points(T_damage_change, place_mm * MM) / MM
+    sizes = []
+    for finding in damage:
+        # by any depth: a hole's centre lies on the surface, that of missing returns behind it
+        off_mm = math.hypot(finding.x_mm - place_mm[0], finding.y_mm - place_mm[1])
+        reach_mm = 0.5 * (np.nan_to_num(finding.diameter_mm) + np.nan_to_num(change.diameter_mm))
+        if off_mm <= reach_mm:
+            sizes.append(Size.of(finding))
+    return max(sizes, key=lambda size: np.nan_to_num(size.diameter_mm), default=None)
+
+
+def _change(
+    finding: Finding,
+    then: Size | None,
+    now: Size | None,
+    *,
+    distance_m: float,
+    lod_m: float,
+) -> Change:
+    """Return what a finding is, from the damage that each capture shows at its place.
+
+    The change's own sign decides between grown and shrunk: it is measured between the captures,
+    while the sizes then and now each contain the error of a smooth surface."""
+    deeper = finding.depth_mm > 0
+    state = NEW
+    if then is not None:
+        is_same_side = (then.depth_mm > 0) == deeper
+        state = GROWN if is_same_side else SHRUNK
+        if not is_same_side and now is None:
+            state = GONE
+    if then is None and now is None:
+        # too small to stand out from a smooth surface: the change itself is its size
+        now = Size.of(finding)
+    return Change(
+        id=finding.id,
+        state=state,
+        then=then,
+        now=now,
+        distance_mm=distance_m / MM,
+        lod_mm=lod_m / MM,
+    )
