@@ -1,15 +1,14 @@
 """What changed between an earlier capture of a part and this one: distances with their level of
 detection, and damage that is new, grown, shrunk or gone, with its size then and now.
 
-Findings are places where the part departs from the earlier capture. Its size then, and its size
-now, are those of the damage that each capture shows there by itself, against a smooth surface."""
+Findings are places where the part departs from the earlier capture. A damage's size then and now is
+what each capture shows there by itself, against a smooth surface."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ from detectors.pixels.noise import median_of
 from detectors.surfaces.change import Distances, distances
 from detectors.surfaces.scans import Scan
 from detectors.views.registration.registered import local_normals
+from harness.inspection.verdict import DOUBTFUL
 from harness.report.findings import Finding, Judged
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 
@@ -31,6 +31,8 @@ CORES = 2000
 """Number of core points over the part."""
 NORMAL_POINTS = 40
 """Points whose plane gives a normal: over a neighbourhood of twice a cylinder's area."""
+LEAST_COVERED = 0.3
+"""Least share of a change that a damage covers: a damage that grows covers more of it."""
 NEW = "new"
 GROWN = "grown"
 SHRUNK = "shrunk"
@@ -76,7 +78,7 @@ class Changes:
     """All that changed."""
 
     damage: tuple[Change, ...]
-    """One for each finding with a place on the part, in order."""
+    """One for each finding that is not doubtful, in order."""
     cores_m: np.ndarray
     """(n, 3): core points, frame of this capture."""
     distances: Distances
@@ -161,14 +163,21 @@ def changes_of(result: Judged, earlier: Scan, then: Judged, now: Judged) -> Chan
     )
     damage = []
     for number, finding in enumerate(result.findings):
+        if finding.certainty == DOUBTFUL:
+            continue
         index = len(cores_m) + number
-        size_then = _size_at(finding, then.findings, T_reference_camera)
-        size_now = _size_at(finding, now.findings, np.eye(4))
+        places_m = cloud.points_m.reshape(-1, 3)[result.detections[number].pixels]
+        places_m = places_m[np.isfinite(places_m[:, 2])]
+        size_then = _size_at(places_m, then, T_reference_camera, earlier.pitch_m)
+        size_now = _size_at(places_m, now, np.eye(4), earlier.pitch_m)
+        departed_then_m = _departure_m(places_m, then, T_reference_camera)
+        departed_now_m = _departure_m(places_m, now, np.eye(4))
         damage.append(
             _change(
                 finding,
                 size_then,
                 size_now,
+                was_there=abs(departed_then_m) > abs(departed_now_m),
                 distance_m=float(measured.distance_m[index]),
                 lod_m=float(measured.lod_m[index]),
             )
@@ -192,20 +201,43 @@ def _centres(result: Judged) -> np.ndarray:
 
 
 def _size_at(
-    change: Finding, damage: Sequence[Finding], T_damage_change: np.ndarray
+    places_m: np.ndarray, damage: Judged, T_damage_change: np.ndarray, pitch_m: float
 ) -> Size | None:
-    """Return the size of the largest damage that covers the place of a change: their outlines
-    meet. ``T_damage_change`` (4, 4): from the change's frame."""
-    place_mm = np.array([change.x_mm, change.y_mm, change.z_mm])
-    place_mm = transform_points(T_damage_change, place_mm * MM) / MM
-    sizes = []
-    for finding in damage:
-        # by any depth: a hole's centre lies on the surface, that of missing returns behind it
-        off_mm = math.hypot(finding.x_mm - place_mm[0], finding.y_mm - place_mm[1])
-        reach_mm = 0.5 * (np.nan_to_num(finding.diameter_mm) + np.nan_to_num(change.diameter_mm))
-        if off_mm <= reach_mm:
-            sizes.append(Size.of(finding))
-    return max(sizes, key=lambda size: np.nan_to_num(size.diameter_mm), default=None)
+    """Return the size of the finding that covers most of the places (n, 3) of a change, if it
+    covers `LEAST_COVERED` of them. ``T_damage_change`` (4, 4): from the change's frame."""
+    sought = transform_points(T_damage_change, places_m)[:, :2]
+    best = LEAST_COVERED
+    size = None
+    points_m = damage.cloud.points_m.reshape(-1, 3)
+    for finding, detection in zip(damage.findings, damage.detections, strict=True):
+        of_finding = points_m[detection.pixels]
+        of_finding = of_finding[np.isfinite(of_finding[:, 2])]
+        if not len(of_finding) or not len(sought):
+            continue
+        off_m, _ = cKDTree(of_finding[:, :2]).query(sought)
+        covered = float((off_m <= pitch_m).mean())
+        if covered >= best:
+            best = covered
+            size = Size.of(finding)
+    return size
+
+
+def _departure_m(places_m: np.ndarray, damage: Judged, T_damage_change: np.ndarray) -> float:
+    """Return how far a capture departs at the places (n, 3) of a change from the ring around them,
+    as wide as they are; 0 if either is not judged."""
+    sought = transform_points(T_damage_change, places_m)[:, :2]
+    judged = np.isfinite(damage.evidence.residual_m) & damage.cloud.valid
+    if not len(sought) or not judged.any():
+        return 0.0
+    residuals_m = damage.evidence.residual_m[judged]
+    middle = sought.mean(axis=0)
+    radius_m = float(np.linalg.norm(sought - middle, axis=1).max())
+    off_m = np.linalg.norm(damage.cloud.points_m[judged][:, :2] - middle, axis=1)
+    core_m = residuals_m[off_m < 0.5 * radius_m]
+    ring_m = residuals_m[(off_m > 1.2 * radius_m) & (off_m < 2.0 * radius_m)]
+    if not len(core_m) or not len(ring_m):
+        return 0.0
+    return median_of(core_m) - median_of(ring_m)
 
 
 def _change(
@@ -213,23 +245,36 @@ def _change(
     then: Size | None,
     now: Size | None,
     *,
+    was_there: bool,
     distance_m: float,
     lod_m: float,
 ) -> Change:
-    """Return what a finding is, from the damage that each capture shows at its place.
+    """Return what a finding is, from the damage that each capture shows at its place by itself.
+    ``was_there``: the earlier capture departs more from its surroundings there.
 
-    The change's own sign decides between grown and shrunk: it is measured between the captures,
-    while the sizes then and now each contain the error of a smooth surface."""
-    deeper = finding.depth_mm > 0
-    state = NEW
-    if then is not None:
-        is_same_side = (then.depth_mm > 0) == deeper
-        state = GROWN if is_same_side else SHRUNK
-        if not is_same_side and now is None:
-            state = GONE
+    A capture alone may miss damage beside ribs; its depth then is that of the other capture less
+    the change. Where both show something that does not differ by the change, it is a feature of the
+    part, on which the change lies."""
+    change = Size.of(finding)
+    if then is not None and now is not None:
+        differing_mm = now.depth_mm - then.depth_mm
+        if abs(differing_mm - change.depth_mm) > 0.5 * abs(change.depth_mm):
+            then = None
+            now = None
     if then is None and now is None:
-        # too small to stand out from a smooth surface: the change itself is its size
-        now = Size.of(finding)
+        if was_there:
+            then = Size(change.diameter_mm, -change.depth_mm, change.depth_se_mm)
+        else:
+            now = change
+    elif then is None:
+        then = _rest(now, change, -1.0)
+    elif now is None:
+        now = _rest(then, change, 1.0)
+    state = NEW
+    if now is None:
+        state = GONE
+    elif then is not None:
+        state = GROWN if abs(now.depth_mm) > abs(then.depth_mm) else SHRUNK
     return Change(
         id=finding.id,
         state=state,
@@ -238,3 +283,13 @@ def _change(
         distance_mm=distance_m / MM,
         lod_mm=lod_m / MM,
     )
+
+
+def _rest(size: Size | None, change: Size, sign: float) -> Size | None:
+    """Return what remains of a damage after ``sign`` times a change of its depth; None if nothing
+    is left beyond twice the standard error. Its width is not known."""
+    assert size is not None
+    depth_mm = size.depth_mm + sign * change.depth_mm
+    error_mm = math.hypot(np.nan_to_num(size.depth_se_mm), np.nan_to_num(change.depth_se_mm))
+    is_left = depth_mm * np.sign(size.depth_mm) > 2.0 * error_mm
+    return Size(math.nan, depth_mm, error_mm) if is_left else None
