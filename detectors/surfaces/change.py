@@ -44,7 +44,7 @@ class Distances:
 
     @property
     def is_significant(self) -> np.ndarray:
-        """Which distances (n,) exceed their level of detection."""
+        """True where distances (n,) exceed their level of detection."""
         return np.abs(self.distance_m) > self.lod_m
 
 

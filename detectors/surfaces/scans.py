@@ -63,7 +63,7 @@ PRIOR_PARTS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class PartScan:
     """A part as captures show it, in the camera frame of the first of them."""
 
     name: str
@@ -103,7 +103,7 @@ def noise_m2_of(cloud: Cloud, mask: np.ndarray) -> np.ndarray:
     return np.full(len(points), max(noise_m2, floor_m2))
 
 
-def scan_of(cloud: Cloud, mask: np.ndarray, name: str) -> Scan:
+def scan_of(cloud: Cloud, mask: np.ndarray, name: str) -> PartScan:
     """Return the part that a cloud shows where ``mask`` (h, w) is true. Raises UserError if the
     points span no surface."""
     central = cloud.projection == "central"
@@ -127,7 +127,7 @@ def _scan(
     noise_m2: np.ndarray,
     share_px: float,
     parts: int,
-) -> Scan:
+) -> PartScan:
     plan = _plan(points_m, central)
     if len(points_m) < 100 or np.linalg.matrix_rank(plan - plan.mean(axis=0)) < 2:
         raise UserError(f"{name}: {len(points_m)} points of the part span no surface")
@@ -147,7 +147,7 @@ def _scan(
     coarse_faces, _ = _faces(middles)
     triangles = _towards_viewer(points_m, faces, variances_m2, central)
     sides_m = np.linalg.norm(triangles.corners_m[:, 0] - triangles.corners_m[:, 1], axis=1)
-    return Scan(
+    return PartScan(
         name=name,
         points_m=points_m,
         variances_m2=variances_m2,
@@ -192,7 +192,7 @@ def _towards_viewer(
 
 
 def placed(
-    scan: Scan, points_m: np.ndarray, share_px: float, central: bool, known: KnownPose | None
+    scan: PartScan, points_m: np.ndarray, share_px: float, central: bool, known: KnownPose | None
 ) -> Pose:
     """Return the pose of a part's points (n, 3) on a scan. ``central``: their rays leave the lens;
     ``known``: the pose by marks."""
@@ -263,7 +263,7 @@ def _facing(normal: np.ndarray, along: np.ndarray, middle_m: np.ndarray) -> np.n
 
 
 def laid_under(
-    scan: Scan, cloud: Cloud, mask: np.ndarray, known: KnownPose | None = None
+    scan: PartScan, cloud: Cloud, mask: np.ndarray, known: KnownPose | None = None
 ) -> ExpectedSurface:
     """Return what a scan says that a cloud should show where ``mask`` (h, w) is true. ``known``:
     the pose by marks. Raises UserError if the scan does not show this part."""
@@ -319,7 +319,7 @@ def _another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndar
     )
 
 
-def _text(scan: Scan, pose: Pose, median_off_m: float, by_marks: bool) -> str:
+def _text(scan: PartScan, pose: Pose, median_off_m: float, by_marks: bool) -> str:
     """Return what the reference is and how well it fits, in words."""
     how = "by marks and surface" if by_marks else "by outline and surface"
     return (
@@ -329,7 +329,7 @@ def _text(scan: Scan, pose: Pose, median_off_m: float, by_marks: bool) -> str:
 
 
 def _facts(
-    scan: Scan, pose: Pose, median_off_m: float, overlap: float, by_marks: bool
+    scan: PartScan, pose: Pose, median_off_m: float, overlap: float, by_marks: bool
 ) -> dict[str, Any]:
     return {
         "name": scan.name,
@@ -351,7 +351,7 @@ def _facts(
 class GoodParts:
     """Several good parts on the places of the first."""
 
-    first: Scan
+    first: PartScan
     """The part on whose places the others lie."""
     central: bool
     """Whether its rays leave the lens, else they are parallel."""
@@ -360,7 +360,7 @@ class GoodParts:
     noises_m2: np.ndarray
     """(k, n): variance of that z by the noise of its capture."""
 
-    def mean(self, name: str, left_out: int | None = None) -> Scan:
+    def mean(self, name: str, left_out: int | None = None) -> PartScan:
         """Return the mean of all parts, or of all but one, with the variance of the next part.
 
         With k parts the mean's error is 1/k of the scatter. The scatter of one place is known
@@ -393,7 +393,7 @@ class GoodParts:
 
 
 def good_parts(
-    first: Scan, others: Sequence[tuple[Scan, KnownPose | None]], central: bool
+    first: PartScan, others: Sequence[tuple[PartScan, KnownPose | None]], central: bool
 ) -> GoodParts:
     """Lay good parts on the first. ``others``: each with the pose of the first on it by marks, if
     it is known; ``central``: whether the first one's rays leave the lens. Raises UserError for a

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from detectors.pixels.noise import median_of
 from detectors.surfaces.change import Distances, distances
-from detectors.surfaces.scans import Scan
+from detectors.surfaces.scans import PartScan
 from detectors.views.registration.registered import local_normals
 from harness.inspection.verdict import DOUBTFUL
 from harness.report.findings import Finding, Judged
@@ -41,7 +41,7 @@ STATES = (NEW, GROWN, SHRUNK, GONE)
 
 
 @dataclass(frozen=True)
-class Size:
+class DamageSize:
     """The size of a damage in one capture."""
 
     diameter_mm: float
@@ -50,22 +50,22 @@ class Size:
     depth_se_mm: float
 
     @classmethod
-    def of(cls, finding: Finding) -> Size:
+    def of(cls, finding: Finding) -> DamageSize:
         """Return the size of a finding."""
         return cls(finding.diameter_mm, finding.depth_mm, finding.depth_se_mm)
 
 
 @dataclass(frozen=True)
-class Change:
+class DamageChange:
     """A finding that is a change."""
 
     id: int
     """Its number among the findings."""
     state: str
     """One of `STATES`."""
-    then: Size | None
+    then: DamageSize | None
     """Its size in the earlier capture; None if that shows no damage there."""
-    now: Size | None
+    now: DamageSize | None
     """Its size in this capture."""
     distance_mm: float
     """Distance between both captures at its centre, + behind; NaN if not measured."""
@@ -77,7 +77,7 @@ class Change:
 class Changes:
     """All that changed."""
 
-    damage: tuple[Change, ...]
+    damage: tuple[DamageChange, ...]
     """One for each finding that is not doubtful, in order."""
     cores_m: np.ndarray
     """(n, 3): core points, frame of this capture."""
@@ -94,13 +94,14 @@ class Changes:
         return median_of(known) / MM if len(known) else math.nan
 
     @property
+    def counts(self) -> dict[str, int]:
+        """The number of damages in each state."""
+        return {state: sum(change.state == state for change in self.damage) for state in STATES}
+
+    @property
     def sentence(self) -> str:
-        """Return ``1 damage new, 2 grown``, with the level of detection."""
-        counts = []
-        for state in STATES:
-            count = sum(change.state == state for change in self.damage)
-            if count:
-                counts.append(f"{count} {state}")
+        """Return ``1 new, 2 grown``, with the level of detection."""
+        counts = [f"{count} {state}" for state, count in self.counts.items() if count]
         found = ", ".join(counts) or "no damage is new, grown, shrunk or gone"
         typical = f"{self.lod_mm:.2g} mm at a typical place (95 %)"
         return f"{found}; changes over {2 * self.radius_m / MM:.2g} mm are detected from {typical}"
@@ -133,7 +134,7 @@ class Changes:
         return stream.getvalue()
 
 
-def changes_of(result: Judged, earlier: Scan, then: Judged, now: Judged) -> Changes:
+def changes_of(result: Judged, earlier: PartScan, then: Judged, now: Judged) -> Changes:
     """Compare a capture with an earlier one. ``result``: judged against it; ``then`` and ``now``:
     the earlier and this capture, each judged by itself."""
     cloud = result.cloud
@@ -202,7 +203,7 @@ def _centres(result: Judged) -> np.ndarray:
 
 def _size_at(
     places_m: np.ndarray, damage: Judged, T_damage_change: np.ndarray, pitch_m: float
-) -> Size | None:
+) -> DamageSize | None:
     """Return the size of the finding that covers most of the places (n, 3) of a change, if it
     covers `LEAST_COVERED` of them. ``T_damage_change`` (4, 4): from the change's frame."""
     sought = transform_points(T_damage_change, places_m)[:, :2]
@@ -218,7 +219,7 @@ def _size_at(
         covered = float((off_m <= pitch_m).mean())
         if covered >= best:
             best = covered
-            size = Size.of(finding)
+            size = DamageSize.of(finding)
     return size
 
 
@@ -242,20 +243,20 @@ def _departure_m(places_m: np.ndarray, damage: Judged, T_damage_change: np.ndarr
 
 def _change(
     finding: Finding,
-    then: Size | None,
-    now: Size | None,
+    then: DamageSize | None,
+    now: DamageSize | None,
     *,
     was_there: bool,
     distance_m: float,
     lod_m: float,
-) -> Change:
+) -> DamageChange:
     """Return what a finding is, from the damage that each capture shows at its place by itself.
     ``was_there``: the earlier capture departs more from its surroundings there.
 
     A capture alone may miss damage beside ribs; its depth then is that of the other capture less
     the change. Where both show something that does not differ by the change, it is a feature of the
     part, on which the change lies."""
-    change = Size.of(finding)
+    change = DamageSize.of(finding)
     if then is not None and now is not None:
         differing_mm = now.depth_mm - then.depth_mm
         if abs(differing_mm - change.depth_mm) > 0.5 * abs(change.depth_mm):
@@ -263,7 +264,7 @@ def _change(
             now = None
     if then is None and now is None:
         if was_there:
-            then = Size(change.diameter_mm, -change.depth_mm, change.depth_se_mm)
+            then = DamageSize(change.diameter_mm, -change.depth_mm, change.depth_se_mm)
         else:
             now = change
     elif then is None:
@@ -275,7 +276,7 @@ def _change(
         state = GONE
     elif then is not None:
         state = GROWN if abs(now.depth_mm) > abs(then.depth_mm) else SHRUNK
-    return Change(
+    return DamageChange(
         id=finding.id,
         state=state,
         then=then,
@@ -285,11 +286,11 @@ def _change(
     )
 
 
-def _rest(size: Size | None, change: Size, sign: float) -> Size | None:
+def _rest(size: DamageSize | None, change: DamageSize, sign: float) -> DamageSize | None:
     """Return what remains of a damage after ``sign`` times a change of its depth; None if nothing
     is left beyond twice the standard error. Its width is not known."""
     assert size is not None
     depth_mm = size.depth_mm + sign * change.depth_mm
     error_mm = math.hypot(np.nan_to_num(size.depth_se_mm), np.nan_to_num(change.depth_se_mm))
     is_left = depth_mm * np.sign(size.depth_mm) > 2.0 * error_mm
-    return Size(math.nan, depth_mm, error_mm) if is_left else None
+    return DamageSize(math.nan, depth_mm, error_mm) if is_left else None

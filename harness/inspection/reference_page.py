@@ -5,7 +5,7 @@ from __future__ import annotations
 from markupsafe import Markup
 
 from harness.inspection import output
-from harness.inspection.changes import Changes, Size
+from harness.inspection.changes import Changes, DamageSize
 from harness.report.blocks import joined, paragraph
 from harness.vocabulary.text import Grid
 
@@ -38,7 +38,7 @@ def changes_section(changes: Changes) -> Markup:
     return joined(parts)
 
 
-def _size_texts(size: Size | None) -> tuple[str, str]:
+def _size_texts(size: DamageSize | None) -> tuple[str, str]:
     """Return width and depth, or dashes."""
     if size is None:
         return "-", "-"

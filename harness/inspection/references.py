@@ -14,7 +14,7 @@ import numpy as np
 from detectors.crop import AnyCrop, crop
 from detectors.interface import Detector, Evidence
 from detectors.surfaces.expected import KnownPose
-from detectors.surfaces.scans import GoodParts, Scan, good_parts, laid_under, scan_of
+from detectors.surfaces.scans import GoodParts, PartScan, good_parts, laid_under, scan_of
 from detectors.views.marks.find import find_marks
 from detectors.views.marks.mark import MarksConfig
 from detectors.views.registration.by_marks import register_by_marks
@@ -54,7 +54,7 @@ def captures_in(path: Path) -> tuple[Path, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenPart:
     """A part in a capture."""
 
     name: str
@@ -66,19 +66,19 @@ class Seen:
     """The same with its marks."""
 
     @property
-    def scan(self) -> Scan:
+    def scan(self) -> PartScan:
         """The part as a surface."""
         return scan_of(self.cloud, self.mask, self.name)
 
 
-def seen(name: str, cloud: Cloud, config: AnyCrop, marks: MarksConfig) -> Seen:
+def seen(name: str, cloud: Cloud, config: AnyCrop, marks: MarksConfig) -> SeenPart:
     """Cut a part out of a cloud and find its marks. Raises UserError as the crop does."""
     mask = crop(cloud, config)
     prepared = PreparedView(View(name, cloud, None), mask, find_marks(cloud, mask, marks))
-    return Seen(name, cloud, mask, prepared)
+    return SeenPart(name, cloud, mask, prepared)
 
 
-def pose_by_marks(reference: Seen, part: Seen) -> KnownPose | None:
+def pose_by_marks(reference: SeenPart, part: SeenPart) -> KnownPose | None:
     """Return the pose of a part's cloud on the reference's by marks; None without enough marks."""
     if reference.cloud.rgb is None or part.cloud.rgb is None:
         return None
@@ -96,19 +96,19 @@ class Reference:
     """As stated."""
     recordings: Sequence[Recording]
     """The captures that were read."""
-    parts: Sequence[Seen]
+    parts: Sequence[SeenPart]
     """An earlier capture, or the good parts."""
-    scan: Scan
+    scan: PartScan
     """The surface that is expected."""
     stack: GoodParts | None
     """The good parts; None for an earlier capture."""
 
     @property
     def is_earlier(self) -> bool:
-        """Whether it is the same part at an earlier time."""
+        """True if it is the same part at an earlier time."""
         return self.stack is None
 
-    def under(self, part: Seen, left_out: int | None = None) -> Cloud:
+    def under(self, part: SeenPart, left_out: int | None = None) -> Cloud:
         """Return the cloud of a part with what is expected of it. ``left_out``: the good part that
         does not count. Raises UserError if the reference does not show this part."""
         scan = self.scan
@@ -154,7 +154,7 @@ def reference_of(
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class CheckOnParts:
     """What a detector finds on good parts that are each compared with the others."""
 
     factor: float
@@ -179,7 +179,7 @@ def checked_on_parts(
     detector: Detector,
     judged: Callable[[Detector, Cloud], tuple[float, Evidence]],
     calls: float,
-) -> LeftOut | None:
+) -> CheckOnParts | None:
     """Compare each good part with the others. ``judged``: own threshold and evidence of a detector
     on a cloud; ``calls``: wanted number of findings on a good part. None for fewer than two good
     parts."""
@@ -195,7 +195,7 @@ def checked_on_parts(
     ratios.sort(reverse=True)
     allowed = int(calls * len(parts))
     factor = ratios[allowed] if len(ratios) > allowed else 1.0
-    return LeftOut(
+    return CheckOnParts(
         factor=max(1.0, factor),
         parts=len(parts),
         findings=sum(ratio > 1.0 for ratio in ratios),

@@ -30,7 +30,7 @@ from harness.inspection.choosing import Contender, candidate_of, chosen, noted
 from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
 from harness.inspection.limit import Limit, limit_of
 from harness.inspection.reference_page import changes_section
-from harness.inspection.references import Reference, Seen, checked_on_parts, reference_of, seen
+from harness.inspection.references import Reference, SeenPart, checked_on_parts, reference_of, seen
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
 from harness.inspection.verdict import (
     CLASSES,
@@ -233,7 +233,7 @@ def _reference(
     return reference_of(arguments, opened, crop, cli.marks_of(arguments))
 
 
-def _part(arguments: argparse.Namespace, detector: Detector, cloud: Cloud) -> Seen:
+def _part(arguments: argparse.Namespace, detector: Detector, cloud: Cloud) -> SeenPart:
     """Find the part in the cloud that is judged."""
     crop = getattr(getattr(detector, "settings", None), "crop", NoCrop())
     return seen("this capture", cloud, crop, cli.marks_of(arguments))
@@ -626,7 +626,7 @@ def _page_html(
         warnings=(*warnings_of(run), *further_warnings),
         classes={name: CLASSES[name] for name in run.verdict.counts},
         flags=FLAGS,
-        summary=tuple(_summary_rows(run.verdict)),
+        summary=tuple(_summary_rows(run)),
         judged=tuple(_judged_rows(run)),
         facts=tuple(_fact_rows(run)),
         further=_sections(run),
@@ -648,12 +648,17 @@ def _conditions(run: Inspection) -> str:
         distance_m = float(np.median(run.result.evidence.surface_z_m[is_judged]))
         parts.append(f"{distance_m:.2f} m away")
     parts.append(f"detector {run.detector.name} {run.detector.version}")
+    if run.reference is not None:
+        parts.append(f"compared with {run.reference.scan.name}")
     return ", ".join(parts)
 
 
-def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
+def _summary_rows(run: Inspection) -> list[tuple[str, str]]:
     """Return the figures of the verdict."""
+    verdict = run.verdict
     rows = [(name, str(count)) for name, count in verdict.counts.items()]
+    if run.changes is not None:
+        rows += [(state, str(count)) for state, count in run.changes.counts.items()]
     extent = verdict.extent
     if np.isfinite(extent.judged_m2):
         rows.append(("judged", _area_text(extent.judged_m2)))

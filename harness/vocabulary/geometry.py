@@ -295,7 +295,7 @@ class MapViews:
 
 @dataclass(frozen=True, eq=False)
 class ExpectedSurface:
-    """What a reference (an earlier capture, good parts, a drawing) says that a cloud should show,
+    """The surface that a reference (an earlier capture, good parts, a drawing) says a cloud shows,
     along its own rays. The functions take points (n, 3) of the cloud's frame, metres, and return
     (n,), NaN where the reference shows nothing."""
 

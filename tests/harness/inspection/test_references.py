@@ -13,7 +13,7 @@ import trimesh
 
 from harness import detect
 from harness.inspection.arguments import is_mesh
-from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, Size, _change
+from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change
 from harness.inspection.references import captures_in
 from tests.harness.inspection.test_verdict import finding
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
@@ -125,8 +125,8 @@ def test_mistakes_are_told(captures: Path, capsys: pytest.CaptureFixture[str]) -
 def test_states(
     change_mm: float, then_mm: float | None, now_mm: float | None, was_there: bool, state: str
 ) -> None:
-    def size(depth_mm: float | None) -> Size | None:
-        return None if depth_mm is None else Size(10.0, depth_mm, 0.1)
+    def size(depth_mm: float | None) -> DamageSize | None:
+        return None if depth_mm is None else DamageSize(10.0, depth_mm, 0.1)
 
     found = finding(depth_mm=change_mm, depth_se_mm=0.1, diameter_mm=10.0)
     change = _change(
