@@ -62,8 +62,9 @@ class SurfaceConfig(Config):
     """The kind of surface that is fitted, and how."""
 
     # ``polynomial``, of the stated degree; ``auto``, the simplest of plane, polynomials, quadric
-    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's
-    shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
+    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's;
+    # ``expected``, what the cloud's own reference says
+    shape: Literal["polynomial", "auto", "free_form", "mesh", "expected"] = "polynomial"
     # the mesh that is fitted to the cloud
     reference: ReferenceConfig | None = None
     # width above which a free form follows the cloud
