@@ -239,6 +239,29 @@ DAMAGE = "#ff00ff"
 """Magenta, the colour of damage in the clouds of the thesis."""
 COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
 """Colours of lines, in order."""
+HIT = "#005b96"
+MISS = "#b34700"
+GUIDE = "#cfd6dd"
+"""Colour of guides behind the data."""
+ON_IMAGE = "#10151b"
+"""Colour of lines and text on an image of residuals, whose colours are the same in the dark."""
+THEME = {
+    "#ffffff": "--page",
+    INK: "--ink",
+    GREY: "--grey",
+    PALE: "--line",
+    GUIDE: "--line",
+    HIT: "--yes",
+    MISS: "--no",
+    BLUE: "--blue",
+    ORANGE: "--orange",
+    GREEN: "--green",
+    RED: "--red",
+    SKY: "--sky",
+    PURPLE: "--purple",
+}
+"""The page's variables (`style.css`) that a figure's colours become, so that a figure follows a
+light or a dark page; `ON_IMAGE` and `DAMAGE` do not."""
 MARKERS = "osD^vP"
 """Markers of lines, in order."""
 STYLE: dict[str, Any] = {
@@ -285,11 +308,19 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{name}-", body)
+    body = _themed(body)
     for side in ("width", "height"):
         body = re.sub(rf'(<svg[^>]*?) {side}="[^"]*"', r"\1", body, count=1)
     values = json.dumps(_values(drawn), separators=(",", ":"), ensure_ascii=False)
     attributes = f'role="img" aria-label="{escape(alt)}" data-values="{escape(values)}"'
     return body.replace("<svg", f"<svg {attributes}", 1)
+
+
+def _themed(body: str) -> str:
+    """Return a figure whose colours of `THEME` are the page's; elsewhere they stay as drawn."""
+    for colour, variable in THEME.items():
+        body = body.replace(f": {colour.lower()}", f": var({variable}, {colour.lower()})")
+    return body
 
 
 def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:

@@ -3,8 +3,10 @@ same every time."""
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -31,6 +33,7 @@ PROVENANCE = {
 YAML = "name: limits # <few> & many\n"
 SECTIONS = [
     "Detection limits",
+    "Probability of detection",
     "Limits against each axis",
     "Size and depth",
     "False calls and chance hits",
@@ -127,6 +130,8 @@ def structure(page: str) -> Structure:
 def test_every_section_is_there(page: str) -> None:
     assert headings(page) == SECTIONS
     for name in (
+        "limits",
+        "sight",
         "overlay",
         "axis-1",
         "axis-2",
@@ -151,9 +156,26 @@ def test_nothing_comes_from_outside(structure: Structure) -> None:
 def test_every_figure_has_words_for_those_who_cannot_see(
     structure: Structure, whole: StudyResult
 ) -> None:
-    assert len(structure.labels) == 7
+    assert len(structure.labels) == 9
     assert all(len(label) > 40 for label in structure.labels)
     assert not [label for label in structure.labels if "nan" in label.split()]
+
+
+def test_the_first_figure_shows_each_interval_of_a90_in_a_row_of_its_own(
+    whole: StudyResult, page: str
+) -> None:
+    (figure,) = re.findall(r'<figure id="limits">.*?</figure>', page, re.DOTALL)
+    (values,) = re.findall(r'data-values="([^"]+)"', figure)
+    (panel,) = json.loads(unescape(values))
+    rows = {name: (at[2], at[6], at[3]) for name, *at in panel["lines"]}
+    expected = {
+        limit.record.label: (limit.a90_interval_mm.low, limit.a90_interval_mm.high, row)
+        for row, limit in enumerate(whole.limits)
+    }
+    assert rows.keys() == expected.keys()
+    for name, (low_mm, high_mm, row) in expected.items():
+        ends_mm = (low_mm, min(high_mm, whole.limits[row].largest_mm), row)
+        assert rows[name] == pytest.approx(ends_mm, rel=1e-3)
 
 
 def test_the_users_words_are_escaped(page: str) -> None:
