@@ -6,18 +6,20 @@ from pathlib import Path
 
 from scipy.stats import binomtest
 
-from tests.mutants.kinds import RULES, Mutant
+from tests.mutants.kinds import Mutant
 
-HEAD = """# Mutants: small faults that the tests must notice
+HEAD = """# See what the tests notice
 
-Written by `make mutants`, not edited by hand. {number} small faults of the numeric modules are
-drawn with the seed {seed}, at most one of an expression. Each is put into a copy of the tree, where
-the tests of its room run without the slow ones. A fault is killed if a test fails or takes much too
-long.
+{share} of small faults in the numeric modules are noticed by the tests of their rooms (Wilson's
+95 % interval).
 
 <!-- artefact: mutants -->
 
 <!-- end: mutants -->
+
+`make mutants` writes this page. {number} faults are drawn with the seed {seed}, at most one of an
+expression. Each is put into a copy of the tree, where the tests of its room run without the slow
+ones. A fault is killed if a test fails or takes much too long. Rooms in which faults live:
 """
 
 
@@ -65,12 +67,15 @@ def _row(name: str, trials: Sequence[Trial]) -> str:
     return f"| {name} | {len(trials)} | {killed} | {equivalent} | {lives} | {share_text(trials)} |"
 
 
-def _table(first: str, groups: dict[str, list[Trial]], trials: Sequence[Trial]) -> list[str]:
+def _table(rooms: dict[str, list[Trial]], trials: Sequence[Trial]) -> list[str]:
+    """Return the rows of rooms in which faults live, and of all rooms together."""
     lines = [
-        f"| {first} | mutants | killed | equivalent | living | killed of the faults |",
+        "| room | mutants | killed | equivalent | living | killed of the faults |",
         "|---|---|---|---|---|---|",
     ]
-    lines += [_row(name, group) for name, group in groups.items() if group]
+    for room, group in rooms.items():
+        if any(trial.lives for trial in group):
+            lines.append(_row(room, group))
     return [*lines, _row("all", trials), ""]
 
 
@@ -91,15 +96,13 @@ def _listed(trials: Sequence[Trial]) -> list[str]:
 
 def page(trials: Sequence[Trial], seed: int) -> str:
     """Return the page in Markdown. ``trials``: in the order of their files."""
-    rooms = {Path(trial.mutant.file).parent.as_posix(): [] for trial in trials}
-    kinds: dict[str, list[Trial]] = {kind: [] for kind in RULES}
+    rooms: dict[str, list[Trial]] = {}
     for trial in trials:
-        rooms[Path(trial.mutant.file).parent.as_posix()].append(trial)
-        kinds[trial.mutant.kind].append(trial)
-    share = f"{share_text(trials)} of the faults are killed (Wilson's 95 % interval)."
-    lines = [HEAD.format(number=len(trials), seed=seed), share, ""]
-    lines += _table("room", rooms, trials)
-    lines += _table("kind", kinds, trials)
+        room = Path(trial.mutant.file).parent.as_posix()
+        rooms.setdefault(room, []).append(trial)
+    share = share_text(trials)
+    lines = [HEAD.format(share=share, number=len(trials), seed=seed)]
+    lines += _table(rooms, trials)
     lines += ["## Faults that live", "", *_listed([trial for trial in trials if trial.lives])]
     lines += [
         "## Equivalent mutants",

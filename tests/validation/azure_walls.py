@@ -4,8 +4,8 @@
 FOLDER holds frames of a static camera (16-bit PNG, whole millimetres, 640 x 576, NFOV unbinned)
 before plaster walls, and ``wall_mask.png``. Each wall's plane is fitted, the same plane is
 simulated, and one analysis is applied to both: temporal deviation against range and angle, spatial
-correlation of the temporal noise, and the fixed pattern. Writes ``azure_walls.svg`` and
-``azure_walls.md``. Nothing is fitted to make the two agree: the camera's file is used as it
+correlation of the temporal noise, and the fixed pattern. Writes ``azure_walls.svg``,
+``azure_walls.txt`` and ``azure_walls.md``. Nothing is fitted to make the two agree: the camera's file is used as it
 stands, and both walls have the albedo of its calibration point.
 """
 
@@ -264,20 +264,22 @@ def check_folder(folder: Path) -> list[WallCheck]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The program: print the table, write the figure and the page."""
-    from azure_walls_page import figure, page, table
+    from azure_walls_page import TABLES, figure, page, table
 
     parser = argparse.ArgumentParser(
         description="Compare the simulated Azure Kinect with frames of real walls."
     )
     parser.add_argument("folder", type=Path, help="frames (16-bit PNG, mm) and wall_mask.png")
     parser.add_argument(
-        "--out", type=Path, default=Path("docs"), help="where the page and figure go (docs)"
+        "--out", type=Path, default=Path("docs"), help="where page, figure and tables go (docs)"
     )
     args = parser.parse_args(arguments)
 
     def body() -> int:
         checks = check_folder(args.folder)
-        print(table(checks))
+        tables = table(checks)
+        print(tables)
+        write_text(args.out / TABLES, tables + "\n")
         write_text(args.out / "azure_walls.svg", figure(checks))
         write_text(args.out / "azure_walls.md", page(checks, walls_camera()))
         return 0

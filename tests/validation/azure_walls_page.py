@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from scenes.sensor.amcw.facts import AmcwCamera
 
 FIGURE = "azure_walls.svg"
+TABLES = "azure_walls.txt"
 COLOURS = {"measured": INK, "simulated": ORANGE}
 WALL_COLOURS = (BLUE, ORANGE)
 WINDOW_PX = 5
@@ -137,12 +138,8 @@ def _pattern_rows(check: WallCheck) -> list[list[str]]:
     return rows
 
 
-def _markdown(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
-
-
 def table(checks: Sequence[WallCheck]) -> str:
-    """What the program prints: the three tables in plain columns."""
+    """What the program prints and stores: the three tables in plain columns."""
     parts = []
     for head, rows_of in (
         (SIGMA_HEAD, _sigma_rows),
@@ -267,13 +264,7 @@ def _draw_pattern(axes: Any, check: WallCheck) -> None:
 
 def page(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     """The documentation page, in Markdown."""
-    parts = [
-        _set_up(checks, camera),
-        _temporal(checks),
-        _spatial(checks),
-        _pattern(checks, camera),
-        _why(checks),
-    ]
+    parts = [_answer(checks), _set_up(checks, camera), _numbers(checks, camera), _why(checks)]
     return "\n\n".join(_reflowed(block) for part in parts for block in part.split("\n\n")) + "\n"
 
 
@@ -290,6 +281,33 @@ def _reflowed(block: str) -> str:
     )
 
 
+def _answer(checks: Sequence[WallCheck]) -> str:
+    inner = _listed(f"{_span([b.ratio for b in c.by_range_inner])} ({c.wall.name})" for c in checks)
+    complete = _listed(f"{_span([b.ratio for b in c.by_range])} ({c.wall.name})" for c in checks)
+    gap = max(
+        np.abs(c.correlation["measured", False] - c.correlation["simulated", False]).max()
+        for c in checks
+    )
+    times = _listed(f"{c.pattern.std_m / _simulated(c, lambda p: p.std_m):.2f}" for c in checks)
+    return f"""# See the simulated Azure Kinect beside a real one
+
+The simulated noise before two real walls is too low: {inner} times the measured one in the lit cone, {complete} over
+whole walls. Its correlation between pixels differs by at most {gap:.3f}. The measured fixed pattern is {times} times
+the simulated one.
+
+![{_ALT}]({FIGURE})
+
+<!-- artefact: azure_walls -->
+
+<!-- end: azure_walls -->"""
+
+
+_ALT = (
+    "Six panels: temporal deviation against range and angle, correlation and fixed pattern of "
+    "both walls"
+)
+
+
 def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     lens = camera.nominal_lens
     albedo = camera.photons.calibration_albedo.value
@@ -300,38 +318,15 @@ def _set_up(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
         f"({c.wall.mask.sum():,} pixels)"
         for c in checks
     )
-    return f"""# The simulated Azure Kinect beside a real one
+    return f"""A public set has {len(checks[0].wall.z_m)} frames of a static camera (NFOV unbinned, whole
+millimetres); everything except two plaster walls is masked out: {planes}. A plane is fitted to each wall and rendered
+in closed form. The simulated camera takes as many frames of it, and one analysis is applied to both.
 
-This page compares the camera model with a public set of Azure Kinect wall frames ({len(checks[0].wall.z_m)} frames of
-a static camera, NFOV unbinned, 640 x 576,
-whole millimetres; everything except two plaster walls is masked out). {planes[0].upper()}{planes[1:]}.
+    python tests/validation/azure_walls.py FOLDER
 
-<!-- artefact: azure_walls -->
-
-<!-- end: azure_walls -->
-
-![{_ALT}]({FIGURE})
-
-A plane is fitted robustly to each wall (1/z of a plane is a linear function of the rays' slopes x/z and y/z). The
-plane is rendered in closed form, and the simulated camera takes as many frames of it as were recorded. The same
-analysis is applied to the real and the simulated frames. Nothing is fitted to make them agree. The public set states
-no lens parameters, so the camera file's nominal lens is used, with its principal point at
-({lens.cx:.0f}, {lens.cy:.0f}). The walls' albedo at 850 nm is not known; both are assumed to have {albedo}, the albedo
-of the calibration point. Pixels within 3 px of a wall's edge are left out, because their filter window also receives
-light from other surfaces. "Lit cone" means the pixels within 32.5 degrees of the axis, half of the smaller angle of
-view in the specification. Beyond it, the real light decreases towards the edge of the lit field; the light on the
-closed-form plane does not. The camera file limits the lit field by a polygon; this check ignores it, so that every
-measured pixel has a simulated one.
-
-To repeat the comparison:
-
-    python tests/validation/azure_walls.py FOLDER"""
-
-
-_ALT = (
-    "Six panels: temporal deviation against range and angle, correlation and fixed pattern of "
-    "both walls"
-)
+writes this page, its figure and all numbers ([{TABLES}]({TABLES})). Nothing is fitted to make them agree. The lens is
+the file's, with its principal point at ({lens.cx:.0f}, {lens.cy:.0f}); both walls have the assumed albedo {albedo}.
+Pixels within 3 px of a wall's edge are left out. The lit cone reaches to 32.5 degrees from the axis."""
 
 
 def _tilt_deg(check: WallCheck) -> float:
@@ -339,103 +334,39 @@ def _tilt_deg(check: WallCheck) -> float:
     return float(np.degrees(np.arctan(np.hypot(slope_x, slope_y))))
 
 
-def _temporal(checks: Sequence[WallCheck]) -> str:
-    inner = _listed(f"{_span([b.ratio for b in c.by_range_inner])} ({c.wall.name})" for c in checks)
-    complete = _listed(f"{_span([b.ratio for b in c.by_range])} ({c.wall.name})" for c in checks)
+def _numbers(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
+    facts = camera.fixed_pattern
     needed = _listed(f"{c.needed_albedo:.2f} ({c.wall.name})" for c in checks)
-    rows = [row for check in checks for row in _sigma_rows(check)]
     ratios = [np.array([b.ratio for b in c.by_range_inner]) for c in checks]
     spread = max(float(np.abs(r / r.mean() - 1).max()) for r in ratios)
-    return f"""## Temporal deviation against range
-
-The table gives the standard deviation over frames, as rms over the pixels of each range bin of 0.1 m. Bins of fewer
-than 300 pixels are left out. The ratio is simulated to measured.
-
-{_markdown(SIGMA_HEAD, rows)}
-
-The ratio of simulated to measured deviation is {inner} in the lit cone and {complete} over whole walls. The simulated
-deviation grows with range like the measured one (each wall's ratios in the lit cone lie within {100 * spread:.0f} % of
-their mean), but it is too small. With an albedo of {needed} instead of the assumed one, the deviations in the lit cone
-would be equal; these albedos are reported, but not used."""
-
-
-def _spatial(checks: Sequence[WallCheck]) -> str:
-    rows = [row for check in checks for row in _correlation_rows(check)]
-    gaps = {
-        jitter: max(
-            np.abs(c.correlation["measured", jitter] - c.correlation["simulated", jitter]).max()
-            for c in checks
-        )
-        for jitter in (True, False)
-    }
     real, ours = (
         _listed(f"{_mm(c.jitter_m[i])} mm ({c.wall.name})" for c in checks) for i in (0, 1)
     )
-    return f"""## Spatial correlation of the temporal noise
-
-{_markdown(CORRELATION_HEAD, rows)}
-
-The table gives the correlation between the noise of pixels that are 1 to 5 px apart (the lag). Each real frame has a
-small range error that all its pixels share (jitter): the mean over all pixels of a wall varies from frame to frame by
-{real}. In the simulation it varies by {ours}. The file's jitter was set from these frames, at the brightness that each
-wall's noise requires; with the brighter walls simulated here it is smaller. Independent pixels would give 0.03 mm. Jitter increases the correlation at all lags alike.
-"Jitter off" means that each frame's mean is subtracted: measured and simulated correlations then differ by at most
-{gaps[False]:.3f} at lags 1 to 5. With jitter they differ by at most {gaps[True]:.3f}."""
-
-
-def _pattern(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
-    facts = camera.fixed_pattern
-    rows = [row for check in checks for row in _pattern_rows(check)]
-    real = _listed(f"{_mm(c.pattern.std_m)} mm" for c in checks)
-    ours = _listed(f"{_mm(_simulated(c, lambda p: p.std_m))} mm" for c in checks)
+    pattern = _listed(f"{_mm(c.pattern.std_m)} mm" for c in checks)
     length = _listed(f"{length_px(c.pattern):.1f} px" for c in checks)
-    white = _listed(f"{_mm(white_before_m(c.pattern))} mm" for c in checks)
-    planted = facts.pixel_mm.value / camera.engine.window_px.value
-    return f"""## Fixed pattern
-
-The fixed pattern is the average of the frames minus a robustly fitted surface of degree 5 in 1/z. The average still
-contains temporal noise: its covariance, divided by the number of frames, is subtracted from the covariance of the
-residual at every lag.
-
-{_markdown(PATTERN_HEAD, rows)}
-
-The measured standard deviation is {real}, the Gaussian correlation length {length}; the simulated standard deviation
-is {ours} (rms of
-five units). The camera file's {facts.smooth_mm.value} mm and {facts.smooth_length_px.value} px apply along the ray
-before the filter; the filter, the projection to z and the subtraction of the surface reduce
-them. The part of the pattern that is uncorrelated between pixels (white) before the filter window of 5 x 5 pixels
-adds a triangle to the covariance. The file's {facts.pixel_mm.value} mm becomes {planted:.2f} mm after the window; the
-analysis finds a little less in the simulated walls, and {white} in the real walls."""
+    return f"""- **Noise** grows with range like the measured one: in the lit cone each wall's ratios lie within
+  {100 * spread:.0f} % of their mean. Albedos of {needed} would make the deviations equal; they are not used.
+- **Jitter**: the mean of a wall varies from frame to frame by {real}, simulated by {ours}. The file's jitter was set
+  from these frames, at the brightness that each wall's noise requires.
+- **Fixed pattern**: {pattern}, with a correlation length of {length}. The file's {facts.smooth_mm.value} mm and
+  {facts.smooth_length_px.value} px were set from these frames, so the agreement is no test. The plaster's own relief
+  is in it: an upper bound of the camera's pattern."""
 
 
 def _why(checks: Sequence[WallCheck]) -> str:
     angles = np.concatenate([c.wall.angle_deg[c.wall.mask] for c in checks])
-    times = _listed(f"{c.pattern.std_m / _simulated(c, lambda p: p.std_m):.2f}" for c in checks)
     return f"""## Where the simulation deviates, and the likely reasons
 
-- **The simulated temporal noise is too low.** The walls lie {angles.min():.0f} to {angles.max():.0f} degrees off the
-  axis. In the model, light decreases with the angle of incidence, with distance and with the lens's cos^4 law, which
-  barrel distortion partly cancels. Mechanical vignetting and the emitter's angular profile are not published and not
-  modelled; on the axis, where the gain is calibrated, they have no effect. Darker walls (the albedos above) would
-  explain the level too, but not why the ratio decreases with the angle.
-- **The edge of the lit field.** On the right wall the measured deviation doubles within the last 20 px before the edge
-  of the lit field. The renderer's emitter has a linear roll-off between two angles, which are guesses; the closed-form
-  plane has no roll-off.
-{_polygon(checks)}- **The simulated correlation is slightly too low at lags 1 to 3.** Rounding to whole millimetres adds
-  0.29 mm of white noise. Where the simulated deviation is smaller than the real one, the share of this white noise is
-  larger and the correlation lower.
-- **Real noise is correlated beyond the filter window.** Simulated noise within a frame is uncorrelated at 5 px; real
-  noise is still slightly correlated. A frame's error is not the same for all pixels: parts of the walls whose ranges
-  differ by 0.6 m even err in opposite directions. [The cameras](cameras.md#jitter-of-frames) says what fits these
-  errors; the model displaces the frame as a whole.
-- **The fixed patterns agree: measured by simulated {times}.** The two sizes in the camera file were set from these
-  frames, so this agreement is not a test. The white part was set from patches of 3 to 15 pixels, which require a
-  smaller value than this analysis finds. The measured pattern contains the plaster's own relief and texture, and light
-  that walls and ceiling reflect to each other, so it is an upper bound of the camera's pattern. At the first lags its
-  covariance decreases faster than a Gaussian; it also has a longer tail and differs between x and y. The model is the
-  sum of one isotropic Gaussian field and white noise.
-- **The frames show one unit and one pair of walls.** There are {len(checks[0].wall.z_m)} frames. The spread between
-  units is not known."""
+- **The noise is too low.** The walls lie {angles.min():.0f} to {angles.max():.0f} degrees off the axis. Mechanical
+  vignetting and the emitter's angular profile are not published and not modelled; on the axis, where the gain is
+  calibrated, they have no effect. Darker walls alone would not explain why the ratio falls with the angle.
+- **The edge of the lit field.** On the right wall the measured deviation doubles within the last 20 px; the
+  closed-form plane has no roll-off there.
+{_polygon(checks)}- **The correlation is slightly too low at lags 1 to 3.** Rounding to whole millimetres adds 0.29 mm of
+  white noise, whose share is larger where the simulated noise is smaller.
+- **Real noise is correlated beyond the filter window**, and parts of a wall err in opposite directions
+  ([jitter](cameras.md#jitter-of-frames)).
+- **One unit and one pair of walls**: the spread between units is not known."""
 
 
 def _polygon(checks: Sequence[WallCheck]) -> str:
