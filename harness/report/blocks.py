@@ -46,6 +46,8 @@ MOST_NAMED = 3
 MOST_VALUES = 81
 """Most points of a line whose values are shown under the pointer."""
 
+MOST_HEADLINE_WORDS = 20
+
 # ---------------------------------------------------------------- the skeleton
 
 
@@ -67,6 +69,7 @@ def template(name: str, folder: Path = HERE) -> Template:
         style=Markup((HERE / "style.css").read_text(encoding="utf-8")),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),
         figure=figure,
+        split_answer=split_answer,
         warnings=(),
         figures={},
         closing="",
@@ -85,8 +88,8 @@ def page(
     under: Iterable[Markup] = (),
     warnings: Iterable[str] = (),
 ) -> str:
-    """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts
-    ``under`` it, the body."""
+    """Return a whole page: ``title``, ``warnings``, the ``answer``, whose beginning is the
+    headline (`split_answer`), parts ``under`` it, the body."""
     return template("page.html").render(
         title=title,
         answer=answer,
@@ -94,6 +97,23 @@ def page(
         under=joined(under),
         warnings=list(warnings),
     )
+
+
+def split_answer(answer: str) -> tuple[str, str]:
+    """Return the headline of a page, as many sentences and clauses of the answer as have
+    `MOST_HEADLINE_WORDS`, but at least one, and the others."""
+    clauses = re.split(r"(?<=[.;]) ", answer)
+    count = 1
+    while (
+        count < len(clauses) and len(" ".join(clauses[: count + 1]).split()) <= MOST_HEADLINE_WORDS
+    ):
+        count += 1
+    headline = " ".join(clauses[:count])
+    further = " ".join(clauses[count:])
+    if headline.endswith(";"):
+        headline = f"{headline[:-1]}."
+        further = f"{further[0].upper()}{further[1:]}"
+    return headline, further
 
 
 # ---------------------------------------------------------------- elements

@@ -20,7 +20,7 @@ from harness.vocabulary.text import Grid
 
 MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
-FOUND = "Found nine times out of ten"
+FOUND = "Nine in ten found"
 SIZES = re.compile("(diameter|depth|width|length) ")
 """Begins the part of a set-up's label that states a range of sizes."""
 NOT_DEMONSTRATED = "not demonstrated"

@@ -10,7 +10,7 @@ import pytest
 
 from harness import detect
 from harness.programs.atlas import ask
-from harness.report.blocks import THEME
+from harness.report.blocks import THEME, split_answer
 from harness.report.page import report_html
 from harness.report.perspectives import perspectives_html
 from harness.report.sections import About
@@ -21,6 +21,7 @@ from tests.harness.report.test_study_page import SetUp, html, judged, small
 from tests.harness.report.test_study_page import example as study_example
 from tests.support import recorded_plane
 from tests.support.browser import Measured, measure
+from tests.support.pages import first_words
 from tests.support.synthetic_perspectives import MapWorld, perspectives
 from tests.support.synthetic_tables import cameras, example, provenance, tables
 
@@ -52,8 +53,8 @@ def page_texts() -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Measured]]:
-    """What the browser shows of each page by name."""
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The file of each page by name."""
     folder = tmp_path_factory.mktemp("pages")
     paths = {}
     for name, text in page_texts().items():
@@ -65,8 +66,16 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Measured]]
     question = ["--damage", "hole", "--size", "5mm", "--distance", "1m"]
     assert ask.main([*question, "--out", str(folder / "atlas")]) == 0
     paths["atlas"] = folder / "atlas" / "atlas.html"
-    measured = measure(list(paths.values()), folder)
-    return {name: measured[path] for name, path in paths.items()}
+    return paths
+
+
+@pytest.fixture(scope="module")
+def shown(
+    written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, list[Measured]]:
+    """What the browser shows of each page by name."""
+    measured = measure(list(written.values()), tmp_path_factory.mktemp("browser"))
+    return {name: measured[path] for name, path in written.items()}
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -90,6 +99,24 @@ def test_a_page_is_short_on_a_telephone(shown: dict[str, list[Measured]], name: 
     heights_px = [page.height_px for page in shown[name] if page.width_px == 400]
     assert len(heights_px) == 2
     assert max(heights_px) <= TALLEST_PX
+
+
+def test_the_first_clauses_of_an_answer_are_the_headline() -> None:
+    clause = "One two three four five six seven eight nine ten eleven"
+    assert split_answer(f"{clause}.") == (f"{clause}.", "")
+    assert split_answer(f"{clause}; a b; c d.") == (f"{clause}; a b; c d.", "")
+    assert split_answer(f"{clause}; {clause.lower()}; c.") == (
+        f"{clause}.",
+        f"{clause}; c.",
+    )
+    assert split_answer(f"{clause} {clause}. A b.") == (f"{clause} {clause}.", "A b.")
+
+
+@pytest.mark.parametrize("name", [name for name in PAGES if name != "atlas"])
+def test_a_headline_has_at_most_twenty_words(written: dict[str, Path], name: str) -> None:
+    headline = first_words(written[name].read_text(encoding="utf-8"))[0]
+    # a number and its unit, which a no-break space joins, count once
+    assert len(headline.split(" ")) <= 20
 
 
 def test_a_figure_takes_its_colours_from_the_page() -> None:

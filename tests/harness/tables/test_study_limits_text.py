@@ -99,7 +99,7 @@ def test_of_many_set_ups_the_span_and_those_without_a_limit(
     smallest = f"{size(two[1].a90_95.value)} mm (50 frames)"
     largest = f"{size(two[0].a90_95.value)} mm (1 frame)"
     assert answer == (
-        f"Found nine times out of ten by one unit (a90/95): {smallest} to {largest};"
+        f"Nine in ten found by one unit (a90/95): {smallest} to {largest};"
         " 1 of 5 set-ups demonstrates no limit within the sizes inspected."
     )
     none = (
