@@ -40,6 +40,9 @@ class Targets:
     excess: np.ndarray | None = None
     """If each inspection is a row: its signal (n,) above the threshold, in standard errors of the
     threshold; infinite for a damage that is found at any threshold."""
+    threshold: float = np.nan
+    """The threshold: equal ones are drawn again alike, as from one calibration, and others
+    independently."""
 
 
 def targets_of(
@@ -114,7 +117,7 @@ def refitted_sizes(
     if targets.unit is not None:
         rows.append((targets.unit, "units"))
     sizes = []
-    stream = random_stream(0, "thresholds drawn again")
+    stream = random_stream(0, "thresholds drawn again", f"{targets.threshold:.5g}")
     for weights in weights_in_blocks(draws, *rows):
         product = np.multiply.reduce(weights)
         hits = hits_at(targets, stream.standard_normal(len(product)))

@@ -2,11 +2,11 @@
 
 The quoted limit is the bound of the hit/miss curves that fit about equally well, averaged
 (`harness.evaluation.pod.averaged`). It takes damages as independent targets, which damages of one
-board are not quite; so a second bound divides their log-likelihoods by the boards' design effect.
-The intervals of a50 and a90 are of the same averages, with the design effects of a50 and a90.
-Percentiles over resampled boards do not replace either: with few targets or boards that differ
-they cover in 72 to 93 % of studies. Resampled boards serve comparisons, in which what two set-ups
-share cancels. ``tofpod audit`` measures how often all of these cover."""
+board are not quite; so a second bound, and the intervals of a50 and a90, are of curves that are
+shifted from board to board (`harness.evaluation.pod.clustered`). Percentiles over resampled boards
+do not replace them: with few targets, flat curves or boards that differ they cover in 72 to 93 %
+of studies. Resampled boards serve comparisons, in which what two set-ups share cancels.
+``tofpod audit`` measures how often all of these cover."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from harness.evaluation.intervals import (
     false_call_rate,
     percentiles,
 )
-from harness.evaluation.pod.averaged import ModelAverage
+from harness.evaluation.pod.clustered import ClusterAverage
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import METHOD
 from harness.evaluation.pod.inspections import Inspections
@@ -78,7 +78,7 @@ class SetUpLimit:
     a90_interval_mm: Interval
     """95 % interval of a90, likewise."""
     over_boards: Bound
-    """a90/95 with the measured similarity of damages of one board."""
+    """a90/95 with damages of one board as alike as they are found to be."""
     design_effect: float
     """Variance of a90 with boards as units over that with damages as units; NaN if unknown."""
     boards: int
@@ -240,19 +240,16 @@ def _sizes_of_curve(
             inspections=np.ones(len(inspected.hit)),
             unit=unit if record.units > 1 else None,
             excess=excess,
+            threshold=record.threshold,
         )
     (a90_draws_mm,) = np.maximum(refitted_sizes(rows, statement.curve, (POD,), draws), 0.0)
-    effect = _effect_of_boards(statement, targets, POD)
-    average_of_boards = _averaged(statement, effect)
-    over_boards = average_of_boards.bound(POD)
+    assert statement.average is not None  # only a model that a user states has none
+    clustered = ClusterAverage(statement.average, inspected.board)
+    over_boards = clustered.bound(POD)
     margin = ONE_SIDED * size_per_error(rows, statement.curve, POD)
     over_boards = _with_margin(over_boards, statement.a90, margin)
     units: OverUnits | None = None
-    average_of_a50 = _averaged(statement, _effect_of_boards(statement, targets, 0.5))
-    average_of_a90 = average_of_boards
     if record.units > 1:
-        average_of_a50 = _with_units(average_of_a50, rows, 0.5)
-        average_of_a90 = _with_units(average_of_a90, rows, POD)
         units = over_units(
             size_mm=inspected.size_mm,
             hit=inspected.hit,
@@ -268,18 +265,21 @@ def _sizes_of_curve(
         a90_mm=statement.a90,
         a90_draws_mm=a90_draws_mm,
         over_boards=over_boards,
-        a50_interval_mm=_interval(average_of_a50, rows, 0.5),
-        a90_interval_mm=_interval(average_of_a90, rows, POD),
-        design_effect=effect,
+        a50_interval_mm=_interval(clustered, rows, 0.5),
+        a90_interval_mm=_interval(clustered, rows, POD),
+        design_effect=_effect_of_boards(statement, targets),
         over_units=units,
     )
 
 
-def _interval(average: ModelAverage, rows: Targets, pod: float) -> Interval:
-    """Return the average's 95 % interval of the size with this POD, joined with the threshold's
-    as in `_with_margin`."""
-    curve = average.fits[0].curve
-    interval = average.interval(pod)
+def _interval(clustered: ClusterAverage, rows: Targets, pod: float) -> Interval:
+    """Return the 95 % interval of the size with this POD, wider by what units add, and joined with
+    the threshold's as in `_with_margin`."""
+    first = clustered.average.fits[0]
+    curve = first.curve
+    if rows.unit is not None and first.method == "ML":
+        clustered = replace(clustered, effect=units_effect(rows, curve, pod))
+    interval = clustered.interval(pod)
     estimate = curve.size_at(pod)
     margin = TWO_SIDED * size_per_error(rows, curve, pod)
     if not margin or not interval.low > 0:
@@ -313,28 +313,11 @@ def _with_margin(bound: Bound, a90: float, margin: float) -> Bound:
     return replace(bound, value=a90 * float(np.exp(np.hypot(of_hits, margin))))
 
 
-def _effect_of_boards(statement: PodStatement, targets: Targets, pod: float) -> float:
-    """Return the curve's design effect at the size with this POD; NaN for separated data."""
+def _effect_of_boards(statement: PodStatement, targets: Targets) -> float:
+    """Return the curve's design effect at a90; NaN for separated data."""
     if statement.fits[0].method != "ML":
         return np.nan
-    return design_effect(targets, statement.curve, pod)
-
-
-def _averaged(statement: PodStatement, effect: float) -> ModelAverage:
-    """Return the average over the models with this design effect, which divides the
-    log-likelihoods; one below 1 counts as 1, as does NaN."""
-    if statement.average is not None and not effect > 1:
-        return statement.average
-    return ModelAverage(statement.fits, effect)
-
-
-def _with_units(average: ModelAverage, rows: Targets, pod: float) -> ModelAverage:
-    """Return the average with the effect of units at this POD; separated data have none."""
-    first = average.fits[0]
-    if first.method != "ML":
-        return average
-    effect = average.design_effect * units_effect(rows, first.curve, pod)
-    return replace(average, design_effect=effect)
+    return design_effect(targets, statement.curve, POD)
 
 
 def _sizes_if_all_found(targets: Targets, draws: int) -> _Sizes:
