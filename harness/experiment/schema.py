@@ -240,6 +240,19 @@ class StudyConfig(Config):
             "unit alone"
         ),
     )
+    one_unit_calibrates: bool = Field(
+        False,
+        description=(
+            "source.camera.unit_seed sees all boards that teach detectors and set thresholds, "
+            "as if one camera were calibrated for others; false: each has a unit of its own"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _has_other_units(self) -> Self:
+        if self.one_unit_calibrates and self.units is None:
+            raise ValueError("`one_unit_calibrates` needs `units`: there are no others")
+        return self
 
 
 class ExperimentConfig(Config):

@@ -458,8 +458,9 @@ class _StudyBoards:
 
     def _units(self, camera: CameraConfig, role: Role, board: int) -> tuple[CameraConfig, ...]:
         """Return the units of the camera that inspect a board: all of the study's for a damaged
-        board, one of its own for any other; none if the study does not draw units."""
-        if not self.study.units:
+        board, one of its own for any other; none if the camera's own unit does."""
+        calibrates = role in ("learning", "calibration")
+        if not self.study.units or (calibrates and self.study.one_unit_calibrates):
             return ()
         numbers = range(self.study.units) if role == "damaged" else [board]
         seed = self.point.config.seed

@@ -264,7 +264,7 @@ class SetUpRecord:
     """Findings on the damaged boards that match no damage, if kept."""
     units: Annotated[Whole, Field(ge=1)] = 1
     """Number of units of the camera. If more than one, repeat r of a damaged board shows unit r
-    modulo ``units``, and every other board has a unit of its own."""
+    modulo ``units``, and every hole-free board has a unit of its own."""
     drawn: tuple[Annotated[DrawnUnknown, AfterValidator(_one_table)], ...] = ()
     """Unknowns that differ from board to board."""
     threshold_error: ThresholdError | None = None

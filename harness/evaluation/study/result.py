@@ -292,9 +292,9 @@ def _departures(
         ),
         (
             units > 1,
-            f"{units} units of the camera inspected each damaged board, and every other board was "
-            "recorded by its own unit. Intervals of sizes resample units and boards; patches of "
-            "one sensor are assumed to be alike.",
+            f"{units} units of the camera inspected each damaged board, and every board on which "
+            "false calls were counted was recorded by its own unit. Intervals of sizes resample "
+            "units and boards; patches of one sensor are assumed to be alike.",
         ),
         (
             any(limit.record.calibration_runs for limit in limits),
