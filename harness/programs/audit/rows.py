@@ -86,7 +86,7 @@ AUDIT = Table(
             "median ratio",
             "ratio",
             "median of upper end or stated size over the truth; for counted rates the median "
-            "rate per m²",
+            "rate per m², for precisions the median number of damaged boards",
         ),
         Column("verdict", "verdict", "verdict", "whether the interval holds the nominal coverage"),
     ),
