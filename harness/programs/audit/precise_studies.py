@@ -36,7 +36,7 @@ class PreciseCase:
 
     @property
     def name(self) -> str:
-        """What distinguishes them."""
+        """Name of the case."""
         return f"{self.case.name}, a90 to {self.a90_mm:g} mm"
 
 
