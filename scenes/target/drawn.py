@@ -431,8 +431,10 @@ class DrawnTargetConfig(Config):
         depth_parts = (np.arange(count) + depth_stream.random(count)) / count
         depth_parts = depth_stream.permutation(depth_parts)
         if chosen_mm is not None and damage.limit_of == "depth":
-            shallowest_mm, deepest_mm = damage.limit_range_mm
+            # all have one size, and so one range of depths
+            shallowest_mm, deepest_mm = self._depths_mm(low)
             depth_parts = (np.array(chosen_mm) - shallowest_mm) / (deepest_mm - shallowest_mm)
+            depth_parts = np.clip(depth_parts, 0.0, 1.0)
         place_stream = stream("places")
         places_mm = self._edge_places_mm if damage.kind == "chip" else self._places_mm
         # What is placed first has the freest choice: which size that is, is drawn too.
@@ -452,13 +454,18 @@ class DrawnTargetConfig(Config):
             damages.append(self._damage(facts, stream))
         return tuple(damages)
 
-    def _depth_mm(self, size_mm: float, part: float) -> float:
-        """Return the depth at a part, 0..1, of the range that a damage of this size can have."""
+    def _depths_mm(self, size_mm: float) -> tuple[float, float]:
+        """Return the range of depths that a damage of this size can have."""
         least_mm, most_mm = self.damage.depths_mm or (0.0, 0.0)
         if self.damage.kind == "dent":
             legal_mm = _dent_depths_mm(size_mm, _tightest_per_mm(self.board))
             least_mm = max(least_mm, legal_mm[0])
             most_mm = min(most_mm, legal_mm[1])
+        return least_mm, most_mm
+
+    def _depth_mm(self, size_mm: float, part: float) -> float:
+        """Return the depth at a part, 0..1, of the range that a damage of this size can have."""
+        least_mm, most_mm = self._depths_mm(size_mm)
         return float(min(least_mm + (most_mm - least_mm) * part, most_mm))
 
     def _damage(self, facts: dict[str, Any], stream: Stream) -> custom.AnyDamage:

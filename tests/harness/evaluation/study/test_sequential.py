@@ -123,7 +123,8 @@ def test_it_ends_when_all_intervals_are_narrow_but_never_with_the_first_boards()
 
 def test_the_largest_number_of_boards_is_an_honest_end():
     full = replace(START, chosen_mm=((3.0,) * 6,) * 34)
-    ended = after(full, WIDE, NARROW)
+    hardly_wide = Stub((4.0, 5.0), (6.0, 6.6), "another")
+    ended = after(full, hardly_wide, WIDE, NARROW)
     assert not ended.is_reached
     assert "all 40 boards" in ended.reason
     assert "a90 of one is 6 to 8 mm" in ended.reason
