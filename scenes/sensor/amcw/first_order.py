@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.vocabulary.geometry import MM
+from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw.certainty import Certainty, certainty
 from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.imager import AmcwImager, Reading
 from scenes.sensor.amcw.light import Light, light_of_samples
 from scenes.sensor.amcw.linear import DEVIATIONS, Moves, linearised, unknown_filtered
 from scenes.sensor.amcw.linear_frames import TOGETHER, Linear, draw_linear_frame
-from scenes.sensor.amcw.listed import Listed, decoded, draw_readings, listed_of
+from scenes.sensor.amcw.listed import Listed, decoded, listed_of
 from scenes.sensor.amcw.windows import pixels_within, windows_of
 from scenes.sensor.common.normals import standard_normals
 from scenes.sensor.common.unit import DecodedFrame
@@ -270,40 +270,37 @@ class FirstOrder:
         linear = self.linear
         listed = self.listed
         n = linear.z.size
-        step_m = f4(imager.camera.z_step_m)
         z_m = np.empty(n, f4)
+        reason = np.full(n, Reason.VALID, np.uint8)
         amplitude = np.empty(n, f4)
-        reason = np.zeros(n, np.uint8)
+        reading = imager.reading(listed.exposure, rng)
         normals = standard_normals(rng, (2, n))
-        if listed.pixels.size:
-            unit, halo_amplitude, saturated = draw_readings(listed, imager, rng)
-            for of_all, of_halo in zip(
-                normals, self._normals_of(unit, halo_amplitude), strict=True
-            ):
-                of_all[listed.halo] = of_halo
+        of_phase, of_amplitude = self._normals_of(reading)
+        normals[0][listed.halo] = of_phase
+        normals[1][listed.halo] = of_amplitude
         draw_linear_frame(
             self.shape,
             linear,
             normals,
             f4(error_m / imager.camera.z_step_m),
-            step_m,
+            f4(imager.camera.z_step_m),
             z_m,
             amplitude,
         )
         if listed.pixels.size:
-            part = decoded(listed, imager, unit, halo_amplitude, saturated, error_m)
-            z_m[listed.pixels] = part.z_m
-            reason[listed.pixels] = part.reason
-            amplitude[listed.pixels] = part.amplitude
+            of_listed = decoded(listed, imager, reading, error_m)
+            z_m[listed.pixels] = of_listed.z_m
+            reason[listed.pixels] = of_listed.reason
+            amplitude[listed.pixels] = of_listed.amplitude
         shape = self.shape
         return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude.reshape(shape))
 
-    def _normals_of(self, unit: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return the normals (2, g) of the phases and amplitudes of the list's halo."""
+    def _normals_of(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (g,) of the phases and of the amplitudes of the list's halo."""
         noise = self.halo_noise
         g = len(self.listed.halo)
-        re, im = unit[..., :g]
-        size = amplitude[:, :g]
-        across = (im * noise.turn_back.real + re * noise.turn_back.imag) * size
-        longer = size.sum(axis=0) - noise.mean_amplitude
-        return np.stack([across.sum(axis=0), longer / noise.amplitude_noise])
+        re, im = reading.unit[..., :g]
+        amplitude = reading.amplitude[:, :g]
+        across = (im * noise.turn_back.real + re * noise.turn_back.imag) * amplitude
+        longer = amplitude.sum(axis=0) - noise.mean_amplitude
+        return across.sum(axis=0), longer / noise.amplitude_noise

@@ -25,7 +25,7 @@ from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor import source
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.facts import AmcwCamera, ExposuresFacts
-from scenes.sensor.amcw.imager import AmcwImager
+from scenes.sensor.amcw.imager import AmcwImager, Reading
 from scenes.sensor.amcw.light import light_of_samples
 from scenes.sensor.amcw.listed import decoded
 from scenes.sensor.camera import camera_of
@@ -165,7 +165,11 @@ def frames_before(unit: SimulatedUnit) -> tuple[Frames, Frames]:
 
 
 def stacked(unit: SimulatedUnit, frames: list[DecodedFrame]) -> Frames:
-    return Frames(*(np.stack(values)[:, *unit.cut] for values in zip(*frames, strict=True)))
+    return Frames(
+        z_m=np.stack([frame.z_m[unit.cut] for frame in frames]),
+        reason=np.stack([frame.reason[unit.cut] for frame in frames]),
+        amplitude=np.stack([frame.amplitude[unit.cut] for frame in frames]),
+    )
 
 
 @lru_cache
@@ -309,7 +313,7 @@ def test_so_have_those_of_a_dim_and_distant_face(name: str):
 
 def assert_alike(unit: SimulatedUnit, whole: Frames, drawn: Frames) -> None:
     """By every statistic of every group of pixels."""
-    both = Frames(*(np.concatenate(pair) for pair in zip(whole, drawn, strict=True)))
+    both = Frames._make(np.concatenate(pair) for pair in zip(whole, drawn, strict=True))
     assert not np.array_equal(whole.z_m, drawn.z_m, equal_nan=True)
     assert np.array_equal(np.isfinite(drawn.z_m), drawn.reason == Reason.VALID)
     for group, pixels in groups_of(unit).items():
@@ -501,17 +505,17 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     assert model is not None
     assert isinstance(imager, AmcwImager)
     listed = model.listed
-    phasor, amplitude, saturated = imager.phasors(unit.exposure, random_stream(1))
+    reading = imager.reading(unit.exposure, random_stream(1))
     whole = imager.frame(unit.exposure, random_stream(1), 0.002)
     # the last one stands for what is beyond the picture
-    part = decoded(
-        listed,
-        imager,
-        np.pad(phasor[..., listed.halo], ((0, 0), (0, 0), (0, 1))),
-        np.pad(amplitude[:, listed.halo], ((0, 0), (0, 1)), constant_values=kernels.OUTSIDE),
-        saturated[listed.halo],
-        0.002,
+    of_list = Reading(
+        unit=np.pad(reading.unit[..., listed.halo], ((0, 0), (0, 0), (0, 1))),
+        amplitude=np.pad(
+            reading.amplitude[:, listed.halo], ((0, 0), (0, 1)), constant_values=kernels.OUTSIDE
+        ),
+        saturated=reading.saturated[listed.halo],
     )
+    part = decoded(listed, imager, of_list, 0.002)
     assert len(listed.pixels) > 100
     for values, of_picture in zip(part, whole, strict=True):
         wanted = of_picture.ravel()[listed.pixels]
