@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from harness.experiment.schema import CaptureSource, Experiment
+from harness.runs.bill import expected
 from harness.runs.jobs import Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
@@ -119,5 +120,8 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
             f"  the journal holds {many(stored_records, 'trial')}; those of the same code "
             "and settings are not run again"
         )
+    cost = expected(Path(out), name, len(renders), trials)
+    if cost:
+        print(f"  {cost}")
     print(f"  results would go to {folder}")
     return 0

@@ -22,7 +22,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -456,7 +456,9 @@ def serve(
         while True:
             job, memory_mb = pipe.recv()
             _limit_memory(memory_mb)
+            began_s = time.process_time()
             ended = attempt(job, name)
+            ended = replace(ended, processor_s=time.process_time() - began_s)
             try:
                 pipe.send(ended)
             except (TypeError, AttributeError, pickle.PicklingError) as error:
