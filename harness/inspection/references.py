@@ -90,7 +90,7 @@ def pose_by_marks(reference: SeenPart, part: SeenPart) -> KnownPose | None:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What a part is compared with."""
+    """The captures that a part is compared with."""
 
     path: Path
     """As stated."""
@@ -155,7 +155,7 @@ def reference_of(
 
 @dataclass(frozen=True)
 class CheckOnParts:
-    """What a detector finds on good parts that are each compared with the others."""
+    """The findings on good parts that are each compared with the others."""
 
     factor: float
     """Multiple, at least 1, of a capture's own threshold at which good parts have as many findings
