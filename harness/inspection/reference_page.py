@@ -52,14 +52,15 @@ def _size_texts(size: DamageSize | None) -> tuple[str, str]:
     return output.number(size.diameter_mm, 1), depth
 
 
-DECISION_HEADS = ("no.", "tolerance", "measured", "uncertainty", "guard band", "decision", "why")
+DECISION_HEADS = ("no.", "decision", "why", "tolerance", "measured", "uncertainty", "guard band")
+LINE = "_" * 30
+"""What is filled in by hand."""
 
 
 def decision_section(decision: PartDecision, about: Sequence[tuple[str, str]]) -> Markup:
     """Return the decision with its evidence, to be signed. ``about``: part, reference and version
     as names and values."""
-    sentence = decision.sentence
-    parts = [paragraph(f"{sentence[0].upper()}{sentence[1:]}."), definitions(about)]
+    parts = [paragraph(decision.sentence), definitions(about)]
     limits = {tolerance.kind: tolerance.limit_mm for tolerance in decision.tolerances}
     rows = []
     for finding in decision.findings:
@@ -67,19 +68,19 @@ def decision_section(decision: PartDecision, about: Sequence[tuple[str, str]]) -
         rows.append(
             (
                 str(finding.id),
+                finding.decision,
+                finding.reason,
                 f"{finding.kind} {limits[finding.kind]:g}",
                 output.number(finding.value_mm, 2),
                 output.number(uncertainty_mm, 2),
                 output.number(GUARD * uncertainty_mm, 2),
-                finding.decision,
-                finding.reason,
             )
         )
     if rows:
-        parts.append(Grid.of(DECISION_HEADS, rows, left=2).html())
+        parts.append(Grid.of(DECISION_HEADS, rows, left=4).html())
         parts.append(paragraph(_rule_text()))
         parts.append(_budget(decision))
-    signed = [("decided by", ""), ("date", ""), ("signature", "")]
+    signed = [("decided by", LINE), ("date", LINE), ("signature", LINE)]
     parts.append(definitions(signed))
     return joined(parts)
 

@@ -455,6 +455,8 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     """Print warnings (``further_warnings`` last), the verdict, the capture, the surface, the
     threshold, the classes and the strongest findings."""
     output.print_warnings((*warnings_of(run), *further_warnings))
+    if run.decision is not None:
+        print(run.decision.sentence)
     print(run.verdict.sentence)
     if run.mapped is None:
         _print_capture(run)
@@ -467,8 +469,6 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
     print(f"threshold: {_threshold_text(run)}")
-    if run.decision is not None:
-        print(f"tolerance: {run.decision.sentence}")
     if run.changes is not None:
         print(f"change: {run.changes.sentence}")
     if run.limit is not None:
@@ -657,7 +657,7 @@ def _page_html(
 
     text = PageText(
         title=subject,
-        sentence=run.verdict.sentence,
+        sentence=_sentence(run),
         conditions=_conditions(run),
         warnings=(*warnings_of(run), *further_warnings),
         classes={name: CLASSES[name] for name in run.verdict.counts},
@@ -670,6 +670,13 @@ def _page_html(
         provenance=provenance,
     )
     return inspection_html(run.result, scene, text)
+
+
+def _sentence(run: Inspection) -> str:
+    """Return the decision on the tolerances, if there are any, and the verdict."""
+    if run.decision is None:
+        return run.verdict.sentence
+    return f"{run.decision.short}. {run.verdict.sentence}"
 
 
 def _conditions(run: Inspection) -> str:

@@ -27,6 +27,7 @@ from harness.report.findings import Finding, Judged
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.program import length_m
+from harness.vocabulary.text import joined_words
 
 CONFORMS = "conforms"
 FAILS = "does not conform"
@@ -139,22 +140,27 @@ class PartDecision:
         return CONFORMS if is_known else UNDECIDED
 
     @property
-    def sentence(self) -> str:
-        """Return the decision in one sentence, without its full stop."""
+    def short(self) -> str:
+        """Return ``The part does not conform to a depth of at most 0.5 mm (...)``."""
         limits = " and ".join(tolerance.text for tolerance in self.tolerances)
         counts = []
         for decision in DECISIONS:
             numbers = {finding.id for finding in self.findings if finding.decision == decision}
             if numbers and decision != CONFORMS:
-                listed = ", ".join(str(number) for number in sorted(numbers))
-                counts.append(f"{decision}: finding {listed}")
+                listed = joined_words([str(number) for number in sorted(numbers)])
+                counts.append(f"{decision}: finding{'s' * (len(numbers) > 1)} {listed}")
         if self.decision == UNDECIDED:
-            start = "nobody can tell whether the part conforms"
+            start = "Undecided whether the part conforms"
         else:
-            start = f"the part {self.decision}"
+            start = f"The part {self.decision}"
         found = f" ({'; '.join(counts)})" if counts else ""
         limited = f"a growth in {limits} since {self.since}" if self.since else f"a {limits}"
-        return f"{start} to {limited}{found}; {self.missed_text}"
+        return f"{start} to {limited}{found}"
+
+    @property
+    def sentence(self) -> str:
+        """Return the decision and what would have been missed, in one sentence."""
+        return f"{self.short}; {self.missed_text}."
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def test_the_part_is_as_its_worst_finding_and_what_was_missed(
     part = PartDecision((DEPTH,), found, missed, "so much is missed", "")
     assert part.decision == decision
     assert part.facts["decision"] == decision
-    assert part.sentence.endswith("so much is missed")
+    assert part.sentence.endswith("so much is missed.")
 
 
 def test_doubts_about_a_decision() -> None:
@@ -105,8 +105,8 @@ def test_few_simulated_parts_are_decided_wrongly() -> None:
     """The full number of parts is in tests/validation/tolerance_risks.py."""
     decisions = [decided_on(number, None) for number in range(12)]
     assert sum(each.is_wrong for each in decisions) <= 2
-    # a quarter beyond or within the limit is decided
-    clear = [each for each in decisions if not 0.75 < each.true_mm < 1.4]
+    # two guard bands of 0.2 mm from the limit, nearly all are decided
+    clear = [each for each in decisions if not 0.55 < each.true_mm < 1.25]
     assert clear
     assert all(each.decision != UNDECIDED for each in clear)
 
