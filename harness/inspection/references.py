@@ -44,7 +44,10 @@ def captures_in(path: Path) -> tuple[Path, ...]:
     files that are a capture each; none if the path is one capture."""
     if not path.is_dir():
         return ()
-    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    try:
+        entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     if entries and all(entry.is_dir() for entry in entries):
         # the folders of one capture: depth/ beside color/
         return () if (path / "depth").is_dir() else tuple(entries)
