@@ -79,6 +79,11 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
         "sizes"
     )
     add("--limit", nargs="?", const="", metavar="DEPTH", help=limit)
+    tolerance = (
+        "decide whether damage and part conform: depth=0.5mm, width=4mm (ISO 14253-1, with the "
+        "whole uncertainty; takes the analyses of --limit)"
+    )
+    add("--tolerance", action="append", default=[], metavar="SIZE", help=tolerance)
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view. --crop cuts the target out of each view, and the detector "

@@ -85,8 +85,6 @@ class Background:
     """Width above which a free form follows shallow damage; None for other shapes."""
     warning: str
     """A sentence if remaining structure could be mistaken for damage; else empty."""
-    expected: ExpectedSurface | None
-    """The reference that the surface is; None for a surface fitted to the cloud itself."""
     notes: dict[str, Any]
     """Facts by name, as they are recorded."""
 
@@ -223,7 +221,6 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         description=text,
         scale_m=scale_m,
         warning=warning,
-        expected=reference,
         notes=notes,
     )
 
@@ -251,7 +248,6 @@ def _of_few_points(
         description=name,
         scale_m=None,
         warning=f"{len(points)} points are too few to tell whether the surface ({name}) fits",
-        expected=reference,
         notes={"shape": name, "local_noise_m": noise_m, "misfit_share": None},
     )
 

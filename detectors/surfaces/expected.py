@@ -21,8 +21,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from detectors.open3d_library import load_open3d
+from detectors.pixels.noise import median_of
 from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
-from detectors.surfaces.surface import BISQUARE_TUNING, bisquare_weights
+from detectors.surfaces.surface import (
+    BISQUARE_TUNING,
+    SurfaceConfig,
+    bisquare_weights,
+    fit_surface,
+)
 from harness.vocabulary.geometry import (
     MM,
     ExpectedSurface,
@@ -48,6 +54,17 @@ of places."""
 BETWEEN = 0.25
 """Most that a straight line between two samples is off a kink between them, as a share of the
 second difference."""
+LEAST_OVERLAP = 0.5
+"""Least share of the part's points that the reference must show."""
+WORSE = 1.5
+"""A reference is another part if the part lies off it by more than this many times what it lies
+off a cubic surface, ..."""
+BEYOND_NOISE = 3.0
+"""... by more than this many deviations of the noise of both, ..."""
+APART_M = 2.0 * MM
+"""... and by more than this, which is where registered views count as different targets, too."""
+MOST = 0.8
+"""Share of the part, nearest first, on which this is judged: damage may cover the rest."""
 # a direction with a smaller share of the largest information is not fixed by the part
 LOOSE = 1e-6
 
@@ -406,6 +423,24 @@ def met(
     variances_m2 = (shares * triangles.variances_m2[number]).sum(axis=1)
     z = np.where(is_hit, starts[:, 2] + reach, np.nan)
     return z, np.where(is_hit, variances_m2, np.nan)
+
+
+def another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndarray) -> str:
+    """Return why points (n, 3) that lie ``off_m`` (n,) off a reference are another part's; empty
+    if they need not be."""
+    seen = np.isfinite(off_m)
+    x, y, z = points_m[seen].T
+    smooth = fit_surface(x, y, z, SurfaceConfig(method="bisquare"))
+    off_reference_m = float(np.quantile(np.abs(off_m[seen]), MOST))
+    off_smooth_m = float(np.quantile(np.abs(z - smooth.evaluate(x, y)), MOST))
+    noise_m = float(np.sqrt(median_of(variances_m2[seen])))
+    if off_reference_m < max(WORSE * off_smooth_m, BEYOND_NOISE * noise_m, APART_M):
+        return ""
+    return (
+        f"after the best placement {100 * MOST:.0f} % of it lie within"
+        f" {off_reference_m / MM:.2g} mm of the reference, and within {off_smooth_m / MM:.2g} mm of"
+        " a smooth surface"
+    )
 
 
 def closest_of(poses: Sequence[Pose]) -> Pose:

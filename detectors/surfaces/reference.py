@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from detectors.surfaces.expected import (
+    LEAST_OVERLAP,
     LOOSE,
     Pose,
     Triangles,
+    another_part,
     closest_of,
     expected,
     fitted,
+    met,
     normals_of,
     sampled,
     spacing,
@@ -24,7 +27,12 @@ from detectors.surfaces.expected import (
 from detectors.surfaces.surface import ReferenceConfig
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, ExpectedSurface
-from harness.vocabulary.meshes import front_first, read_mesh
+from harness.vocabulary.meshes import UNITS_M, front_first, read_mesh
+
+LARGER = 2.0
+"""Ratio of the target's size to the mesh's from which the mesh cannot be the part."""
+SMALLER = 10.0
+"""Ratio of the mesh's size to the target's from which its outline cannot place the target."""
 
 
 @lru_cache(maxsize=4)
@@ -46,10 +54,12 @@ def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> Ex
     part = front_of(reference)
     front = part.chosen(part.normals[:, 2] > -LOOSE)
     sample = sampled(points)
+    _refuse_unit(reference, front, points)
     poses = []
     for turn in range(4):
         poses.append(fitted(front, sample, _start(front, sample, turn)))
     pose = closest_of(poses)
+    _refuse_other(reference, part, pose, sample, central)
     return expected(
         part,
         pose,
@@ -70,6 +80,60 @@ def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:
     T[:3, :3] = roll @ T[:3, :3]
     T[:3, 3] = front.middle_m - T[:3, :3] @ np.median(points, axis=0)
     return T
+
+
+def _refuse_unit(reference: ReferenceConfig, front: Triangles, points: np.ndarray) -> None:
+    """Raise UserError if points (n, 3) extend beyond the part or are a tiny piece of it, as in a
+    wrong unit of length."""
+    extent_m = _diagonal(points)
+    part_m = _diagonal(front.corners_m.reshape(-1, 3))
+    if part_m / SMALLER < extent_m < LARGER * part_m:
+        return
+    fitting = []
+    for unit, unit_m in UNITS_M.items():
+        ratio = part_m * unit_m / UNITS_M[reference.unit] / extent_m
+        if 1.0 / LARGER < ratio < LARGER:
+            fitting.append(unit)
+    fix = "name the mesh of this part, or choose its surface (--target, --crop)"
+    if fitting:
+        fix = (
+            f"state its unit, if it is {' or '.join(fitting)}: surface.reference.unit={fitting[0]}"
+        )
+    raise UserError(
+        f"{reference.file}: is {part_m / MM:.3g} mm large in {reference.unit}, and the target"
+        f" {extent_m / MM:.3g} mm",
+        legal=f"a target of {1 / SMALLER:g} to {LARGER:g} times the part's size",
+        fix=fix,
+    )
+
+
+def _diagonal(points: np.ndarray) -> float:
+    """Return the diagonal of the box around points (n, 3), without the outermost hundredth."""
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _refuse_other(
+    reference: ReferenceConfig,
+    part: Triangles,
+    pose: Pose,
+    points: np.ndarray,
+    central: bool,
+) -> None:
+    """Raise UserError if points (n, 3) are beside the placed part, or lie off it."""
+    rays = points[:, :2] / points[:, 2:] if central else points[:, :2]
+    z_m, variances_m2 = met(part, pose.T_part_camera, rays, central)
+    off_m = points[:, 2] - z_m
+    overlap = float(np.isfinite(off_m).mean())
+    doubt = f"it shows {100 * overlap:.0f} % of the target"
+    if overlap >= LEAST_OVERLAP:
+        doubt = another_part(points, off_m, variances_m2)
+    if doubt:
+        raise UserError(
+            f"{reference.file}: is not this part: {doubt}",
+            fix="name the mesh of this part, state its front (surface.reference.front) and unit, or"
+            " choose its surface (--target, --crop)",
+        )
 
 
 def _text(reference: ReferenceConfig, pose: Pose) -> str:

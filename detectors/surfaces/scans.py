@@ -19,11 +19,13 @@ import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
 from detectors.pixels.medians import group_medians
-from detectors.pixels.noise import average_variance_m2, median_of, rounding_floor, sigma_of
+from detectors.pixels.noise import average_variance_m2, rounding_floor, sigma_of
 from detectors.surfaces.expected import (
+    LEAST_OVERLAP,
     KnownPose,
     Pose,
     Triangles,
+    another_part,
     expected,
     fitted,
     met,
@@ -32,7 +34,6 @@ from detectors.surfaces.expected import (
     sampled,
     spacing,
 )
-from detectors.surfaces.surface import SurfaceConfig, fit_surface
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, ExpectedSurface, invert
 
@@ -45,17 +46,6 @@ SAME_PLACE_PX = 1.0
 """Mean distance, in pixels, at which the first start is good enough to try no other."""
 BETTER = 0.8
 """Another orientation is taken if its mean distance is less than this share of the first's."""
-LEAST_OVERLAP = 0.5
-"""Least share of the part's points that the reference must show."""
-WORSE = 1.5
-"""A reference is another part if the part lies off it by more than this many times what it lies
-off a cubic surface, ..."""
-BEYOND_NOISE = 3.0
-"""... by more than this many deviations of the noise of both, ..."""
-APART_M = 2.0 * MM
-"""... and by more than this, which is where registered views count as different targets, too."""
-MOST = 0.8
-"""Share of the part, nearest first, on which this is judged: damage may cover the rest."""
 SCATTER_PX = 5
 """Side of the window over which the scatter of parts is averaged."""
 PRIOR_PARTS = 3.0
@@ -282,7 +272,7 @@ def laid_under(
             " (--target, --crop)",
         )
     noise_m2 = noise_m2_of(cloud, mask)
-    doubt = _another_part(points_m, off_m, np.nan_to_num(variances_m2) + noise_m2)
+    doubt = another_part(points_m, off_m, np.nan_to_num(variances_m2) + noise_m2)
     if doubt:
         raise UserError(
             f"{scan.name}: is not this part: {doubt}",
@@ -298,24 +288,6 @@ def laid_under(
         is_sharp=False,
         text=_text(scan, pose, median_off_m, known is not None),
         facts=_facts(scan, pose, median_off_m, overlap, known is not None),
-    )
-
-
-def _another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndarray) -> str:
-    """Return why points (n, 3) that lie ``off_m`` (n,) off a reference are another part's; empty
-    if they need not be."""
-    seen = np.isfinite(off_m)
-    x, y, z = points_m[seen].T
-    smooth = fit_surface(x, y, z, SurfaceConfig(method="bisquare"))
-    off_reference_m = float(np.quantile(np.abs(off_m[seen]), MOST))
-    off_smooth_m = float(np.quantile(np.abs(z - smooth.evaluate(x, y)), MOST))
-    noise_m = float(np.sqrt(median_of(variances_m2[seen])))
-    if off_reference_m < max(WORSE * off_smooth_m, BEYOND_NOISE * noise_m, APART_M):
-        return ""
-    return (
-        f"after the best placement {100 * MOST:.0f} % of it lie within"
-        f" {off_reference_m / MM:.2g} mm of the reference, and within {off_smooth_m / MM:.2g} mm of"
-        " a smooth surface"
     )
 
 
@@ -408,7 +380,7 @@ def good_parts(
         overlap = float(np.isfinite(off_m).mean())
         doubt = f"it shows {100 * overlap:.0f} % of it"
         if overlap >= LEAST_OVERLAP:
-            doubt = _another_part(first.points_m, off_m, first.noise_m2 + np.nan_to_num(noise_m2))
+            doubt = another_part(first.points_m, off_m, first.noise_m2 + np.nan_to_num(noise_m2))
         if doubt:
             raise UserError(
                 f"{scan.name}: is not like {first.name}: {doubt}",

@@ -232,8 +232,12 @@ def is_mesh(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix != ".ply" or not path.is_file():
         return suffix in MESHES
-    with path.open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+    except OSError:
+        # the reader of captures says why
+        return False
     faces = re.search(rb"element face (\d+)", head)
     return faces is not None and int(faces[1]) > 0
 

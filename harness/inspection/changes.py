@@ -1,4 +1,4 @@
-"""What changed between an earlier capture of a part and this one: distances with their level of
+"""Changes between an earlier capture of a part and this one: distances with their level of
 detection, and damage that is new, grown, shrunk or gone, with its size then and now.
 
 Findings are places where the part departs from the earlier capture. A damage's size then and now is

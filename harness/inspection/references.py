@@ -44,7 +44,10 @@ def captures_in(path: Path) -> tuple[Path, ...]:
     files that are a capture each; none if the path is one capture."""
     if not path.is_dir():
         return ()
-    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    try:
+        entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     if entries and all(entry.is_dir() for entry in entries):
         # the folders of one capture: depth/ beside color/
         return () if (path / "depth").is_dir() else tuple(entries)
@@ -90,7 +93,7 @@ def pose_by_marks(reference: SeenPart, part: SeenPart) -> KnownPose | None:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What a part is compared with."""
+    """The captures that a part is compared with."""
 
     path: Path
     """As stated."""
@@ -155,7 +158,7 @@ def reference_of(
 
 @dataclass(frozen=True)
 class CheckOnParts:
-    """What a detector finds on good parts that are each compared with the others."""
+    """The findings on good parts that are each compared with the others."""
 
     factor: float
     """Multiple, at least 1, of a capture's own threshold at which good parts have as many findings

@@ -29,9 +29,15 @@ from harness.inspection.changes import Changes, changes_of
 from harness.inspection.choosing import Contender, candidate_of, chosen, noted
 from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
 from harness.inspection.limit import Limit, limit_of
-from harness.inspection.reference_page import changes_section
+from harness.inspection.reference_page import changes_section, decision_section
 from harness.inspection.references import Reference, SeenPart, checked_on_parts, reference_of, seen
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
+from harness.inspection.tolerance import (
+    PartDecision,
+    Tolerance,
+    part_decision,
+    tolerances_from,
+)
 from harness.inspection.verdict import (
     CLASSES,
     FLAGS,
@@ -43,9 +49,10 @@ from harness.inspection.verdict import (
 from harness.records import outputs
 from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
-from harness.vocabulary.provenance import record
+from harness.vocabulary.provenance import made_by, record
 from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
@@ -94,6 +101,8 @@ class Inspection:
     """The captures that the part is compared with; None for a drawing, or without a reference."""
     changes: Changes | None
     """What changed since an earlier capture; None without one."""
+    decision: PartDecision | None
+    """Whether the part is within its tolerances; None without --tolerance."""
 
     @property
     def cell_m(self) -> float | None:
@@ -133,6 +142,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
     cli.limit_depth_m(arguments)
+    tolerances = tolerances_from(arguments.tolerance)
     detectors = _detectors_of(arguments, config)
     capture = _captured(arguments, paths, config, detectors[0][0])
     candidate = _chosen(arguments, detectors, capture)
@@ -143,6 +153,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
     result = judged(candidate.detector, capture.cloud, evidence, candidate.threshold)
     outline = _outline(capture.choices, capture.mapped)
+    changes = _changes(arguments, config, capture, candidate.detector, result)
     return Inspection(
         arguments=arguments,
         recordings=capture.recordings,
@@ -159,7 +170,8 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         verdict=verdict_of(result, candidate.threshold, outline),
         limit=_limit(arguments, candidate.detector, result, candidate.threshold),
         reference=capture.reference,
-        changes=_changes(arguments, config, capture, candidate.detector, result),
+        changes=changes,
+        decision=_decision(candidate, result, tolerances, changes),
     )
 
 
@@ -343,6 +355,27 @@ def _limit(
     return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
 
 
+def _decision(
+    candidate: Contender,
+    result: Judged,
+    tolerances: Sequence[Tolerance],
+    changes: Changes | None,
+) -> PartDecision | None:
+    """Return the decision on the tolerances, with what would have been missed at them; None without
+    tolerances."""
+    if not tolerances:
+        return None
+    depths_m = [tolerance.limit_mm * MM for tolerance in tolerances if tolerance.kind == "depth"]
+    depth_m = depths_m[0] if depths_m else None
+    missed = None
+    try:
+        missed = limit_of(candidate.detector, result, candidate.threshold, depth_m)
+        text = missed.text
+    except UserError as mistake:
+        text = f"what would have been missed is not known ({mistake.message})"
+    return part_decision(result, tolerances, missed, text, changes)
+
+
 def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evidence:
     """Note the pieces of the chosen part, and how much of each was judged."""
     if choice is None or choice.part is None:
@@ -422,6 +455,8 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     """Print warnings (``further_warnings`` last), the verdict, the capture, the surface, the
     threshold, the classes and the strongest findings."""
     output.print_warnings((*warnings_of(run), *further_warnings))
+    if run.decision is not None:
+        print(run.decision.sentence)
     print(run.verdict.sentence)
     if run.mapped is None:
         _print_capture(run)
@@ -564,6 +599,7 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
         "verdict": run.verdict.facts,
         "limit": None if run.limit is None else run.limit.facts,
         "change": None if run.changes is None else run.changes.facts,
+        "tolerance": None if run.decision is None else run.decision.facts,
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
@@ -621,7 +657,7 @@ def _page_html(
 
     text = PageText(
         title=subject,
-        sentence=run.verdict.sentence,
+        sentence=_sentence(run),
         conditions=_conditions(run),
         warnings=(*warnings_of(run), *further_warnings),
         classes={name: CLASSES[name] for name in run.verdict.counts},
@@ -634,6 +670,13 @@ def _page_html(
         provenance=provenance,
     )
     return inspection_html(run.result, scene, text)
+
+
+def _sentence(run: Inspection) -> str:
+    """Return the decision on the tolerances, if there are any, and the verdict."""
+    if run.decision is None:
+        return run.verdict.sentence
+    return f"{run.decision.short}. {run.verdict.sentence}"
 
 
 def _conditions(run: Inspection) -> str:
@@ -729,11 +772,26 @@ def _fact_rows(run: Inspection) -> list[tuple[str, str]]:
 def _sections(run: Inspection) -> dict[str, Markup]:
     """Return the sections that only some inspections have, by their headings."""
     sections = {}
+    if run.decision is not None:
+        sections["Within tolerance?"] = decision_section(run.decision, _decision_rows(run))
     if run.changes is not None:
         sections["What changed"] = changes_section(run.changes)
     if run.limit is not None:
         sections["What would have been missed"] = _limit_section(run.limit)
     return sections
+
+
+def _decision_rows(run: Inspection) -> list[tuple[str, str]]:
+    """Return part, reference, conditions and version of a decision."""
+    reference = "none: a smooth surface"
+    if run.arguments.reference is not None:
+        reference = str(run.arguments.reference)
+    return [
+        ("part", ", ".join(recording.name for recording in run.recordings)),
+        ("reference", reference),
+        ("conditions", _conditions(run)),
+        ("version", made_by(record(""))),
+    ]
 
 
 def _limit_section(limit: Limit) -> Markup:

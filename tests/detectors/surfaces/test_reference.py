@@ -146,6 +146,25 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
         front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))
 
 
+def test_a_wrong_unit_and_a_wrong_part_are_told(tmp_path: Path) -> None:
+    path = casting(tmp_path / "casting.stl")
+    cloud = seen(path, stood((6, -8, 3)), 0.5)
+    points = cloud.points_m[cloud.valid]
+    metres = tmp_path / "metres.stl"
+    trimesh.load(path).apply_scale(1e-3).export(metres)
+    with pytest.raises(
+        UserError, match=r"is 0\.\d+ mm large in mm, and the target 2\d\d mm"
+    ) as told:
+        laid_on(points, ReferenceConfig(file=str(metres)), central=True)
+    assert told.value.fix == "state its unit, if it is m: surface.reference.unit=m"
+    with pytest.raises(UserError, match="mm large in m, and the target"):
+        laid_on(points, ReferenceConfig(file=str(path), unit="m"), central=True)
+    ball = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(3, 110.0).export(ball)
+    with pytest.raises(UserError, match="is not this part: "):
+        laid_on(points, ReferenceConfig(file=str(ball)), central=True)
+
+
 def test_a_reference_is_stated_on_the_command_line(tmp_path: Path) -> None:
     path = casting(tmp_path / "casting.stl")
     unit = "surface.reference.unit=cm"
