@@ -70,6 +70,9 @@ LOUD_SIGMAS = 3.0  # least residual of the pixels that are connected to such a p
 LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
 MARGIN_PX = 2  # what is removed around loud pixels
 ALONE_PX = 7  # half of the square in which a peak is the highest
+OWN_SHARE = 0.75
+"""A loud part whose score is less than this share of another's nearby is judged once that one is
+removed: wide templates see both."""
 ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 
 # --- scores ---
@@ -479,9 +482,8 @@ def _strong_findings(
 ) -> _Strong:
     """Find strong findings among residuals (r, c) in deviations, and among the `_tamed`.
 
-    A neighbour's shoulder raises or hides what lies beside it, and a template may peak between two
-    holes. So each loud part is judged by its own highest score, and once the strong ones are
-    removed the rest is judged again, until no part of it is strong."""
+    A template may peak between two holes, so each loud part is judged by its own highest score.
+    What lies beside a stronger part is judged once that one is removed, until no part is strong."""
     core = np.zeros(known.shape, bool)
     signed = np.zeros(known.shape)
     template = np.zeros(known.shape, np.uint8)
@@ -527,14 +529,15 @@ def _cores(
     values: np.ndarray,
     known: np.ndarray,
 ) -> list[_Core]:
-    """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c)
-    above `STRONG` of their sign that is no side lobe, and which fill half of the disc of its
-    template's ``radius_px`` (r, c)."""
+    """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c) of
+    their sign above `STRONG`, and at least `OWN_SHARE` of those of loud parts nearby, whose
+    template, of ``radius_px`` (r, c), has a disc that they fill by half."""
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     smooth = cv2.blur(values * known, (3, 3))
     smooth = smooth / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 0.1)
-    around = cv2.dilate(np.abs(signed), np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
+    loud = grown(loud, 1)
+    nearby = cv2.dilate(np.abs(signed) * loud, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8))
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(loud.astype(np.uint8))
     cores = []
     for number in range(1, count):
         left, top, width, height, area = stats[number].tolist()
@@ -546,7 +549,7 @@ def _cores(
         row, column = np.unravel_index(own.argmax(), own.shape)
         score = float(own[row, column])
         peak = int(top + row), int(left + column)
-        least = max(STRONG, LOBE_SHARE * float(around[peak]))
+        least = max(STRONG, OWN_SHARE * float(nearby[peak]))
         if score <= least or area <= LOUD_SHARE * np.pi * radius_px[peak] ** 2:
             continue
         # quiet pixels between loud ones are not a finding of the other sign

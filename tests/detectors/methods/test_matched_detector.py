@@ -380,15 +380,15 @@ def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
     assert not _cores(scores, np.full(values.shape, 9.0), values, is_known)
 
 
-@pytest.mark.parametrize(("beside", "count"), [(20.0, 2), (-9.0, 1), (9.0, 1), (12.0, 2)])
+@pytest.mark.parametrize(("beside", "count"), [(20.0, 2), (16.0, 2), (14.0, 1), (-20.0, 1)])
 def test_a_loud_part_is_judged_by_its_own_score(beside: float, count: int) -> None:
-    """A template that peaks between two holes hides neither. A part whose score is below half of
-    one nearby, or of the other sign than its values, may be a lobe of that one."""
+    """A template that peaks between two holes hides neither. A part waits whose score is less than
+    three quarters of one nearby, or of the other sign than its values."""
     first = disc_at(20, 15)
     second = disc_at(20, 27)
     values = (9.0 * (first | second)).astype(np.float32)
     scores = (20.0 * first + beside * second).astype(np.float32)
-    scores[20, 21] = 22.0
+    scores[20, 21] = 40.0
     is_known = np.ones(values.shape, bool)
     assert len(_cores(scores, np.full(values.shape, 3.2), values, is_known)) == count
 
