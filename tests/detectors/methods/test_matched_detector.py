@@ -189,6 +189,26 @@ def test_heavy_tails_raise_single_pixels_no_farther_than_they_reach() -> None:
     assert len(detections_in(cloud_of(noise_m + hole(60, 45, 4.0, 0.0015)), quiet + 1.0)) == 1
 
 
+@pytest.mark.parametrize(("lone", "is_found"), [(0, True), (1, True), (2, False)])
+def test_a_hole_of_one_pixel_is_found_if_no_pixel_stands_out_without_damage(
+    lone: int, is_found: bool
+) -> None:
+    clouds = []
+    for seed in range(50, 54):
+        noise_m = 3e-4 * np.random.default_rng(seed).standard_normal(SHAPE)
+        if len(clouds) < lone:
+            noise_m[45, 60] += 0.005
+        clouds.append(cloud_of(noise_m))
+    learned = DETECTOR.calibrate(clouds)
+    assert learned["lone"] == lone
+    depth_m = 3e-4 * np.random.default_rng(54).standard_normal(SHAPE)
+    depth_m[45, 60] += 0.005
+    cloud = cloud_of(depth_m)
+    detector = DETECTOR.calibrated(learned)
+    assert (len(detector.find(cloud, detector.analyse(cloud), 6.0)) == 1) == is_found
+    assert not detections_in(cloud, 6.0)
+
+
 # ---- the parts of a score
 
 
