@@ -16,9 +16,11 @@ raised (`detectors.findings.templates.Worth`). Slots are scored on every second 
 each of their peaks the best of many others is looked for (`detectors.methods.slots`).
 
 Strong findings are removed (their pixels count as unknown) and the rest is judged again, until
-none is left, so that no filter sees the shoulder of a neighbouring hole or peaks between two. What
-pixels along the target's outline share beyond those farther in is subtracted. Upsampled depth is
-judged on squares of pixels in which its noise reaches no farther than a camera's window.
+none is left, so that no filter sees the shoulder of a neighbouring hole or peaks between two.
+Single pixels that stand out alone are clipped, unless hole-free clouds have shown that the camera
+makes none. What pixels along the target's outline share beyond those farther in is subtracted.
+Upsampled depth is judged on squares of pixels in which its noise reaches no farther than a camera's
+window.
 
 Not modelled: slots within `RIM_PX` of outlines and of removed findings; distortion of templates on
 steep surfaces; missing returns, except the few that are not findings by themselves
@@ -58,6 +60,9 @@ QUIET_SIGMAS = 4.0  # larger residuals and their neighbours do not count for the
 CLIP_SIGMAS = 5.0
 """Limit to which a pixel is clipped if its neighbours are smaller: a single flying pixel is not a
 finding."""
+MOST_LONE = 1
+"""Most such pixels on the hole-free clouds of a camera that has none by nature. Before it, a hole
+that only one pixel sees may be a finding, so that nothing is clipped."""
 RIM_PX = 6  # depth of the target's rim, to which the camera's window and lens reach over its edge
 LAYER_PX = 4  # side of the squares in which what the rim shares is averaged
 MODEST_SIGMAS = local.LEVEL_SIGMAS  # limit to which residuals are clipped there
@@ -70,6 +75,9 @@ LOUD_SIGMAS = 3.0  # least residual of the pixels that are connected to such a p
 LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
 MARGIN_PX = 2  # what is removed around loud pixels
 ALONE_PX = 7  # half of the square in which a peak is the highest
+OWN_SHARE = 0.75
+"""A loud part whose score is less than this share of another's nearby is judged once that one is
+removed: wide templates see both."""
 ROUGH = 0.4  # error at which C^-1 r is solved for strong findings, as `whitening.CONVERGED`
 
 # --- scores ---
@@ -111,12 +119,15 @@ class MatchedDetector(LocalDetector):
         settings: FilterConfig,
         covariance: np.ndarray | None = None,
         rim: np.ndarray | None = None,
+        lone: np.ndarray | None = None,
     ) -> None:
         """``covariance``: the noise's. ``rim`` (n,): the variances that the rim adds
-        (`rim_variances`). Both are in squared deviations, as `calibrate` has learned them."""
+        (`rim_variances`). Both are in squared deviations. ``lone`` (): number of pixels without
+        damage that stand out alone. All are as `calibrate` has learned them."""
         super().__init__(settings)
         self._covariance = covariance
         self._rim = rim
+        self._clips = lone is None or int(lone) > MOST_LONE
 
     def analyse(self, cloud: Cloud) -> LocalEvidence:
         """Score every pixel of the crop by its depth and by the missing pixels around: the
@@ -156,7 +167,8 @@ class MatchedDetector(LocalDetector):
         rim = self._rim
         if rim is None:
             rim = _rim(residuals, covariance, reach_px, is_alone=True)
-        signed, narrowest = _judged(residuals, covariance, rim)
+        tamed = _tamed(residuals.values) if self._clips else residuals.values
+        signed, narrowest = _judged(residuals, tamed, covariance, rim)
         depth_m = narrowest * float(np.median(residuals.unit_m[residuals.known]))
         unit = (
             f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the"
@@ -182,7 +194,8 @@ class MatchedDetector(LocalDetector):
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the
-        local noise, and the mean variances that their rims add."""
+        local noise, the mean variances that their rims add, and how many pixels stand out
+        alone."""
         pictures = [self.picture(cloud) for cloud in hole_free]
         if not pictures:
             return {}
@@ -191,12 +204,18 @@ class MatchedDetector(LocalDetector):
         reach_px = max(picture.reach_px for picture in pictures)
         is_alone = len(residuals) == 1
         rims = [_rim(one, covariance, reach_px, is_alone=is_alone) for one in residuals]
-        return {"covariance": covariance, "rim": np.mean(rims, axis=0)}
+        lone = sum(int((_tamed(one.values) != one.values).sum()) for one in residuals)
+        return {"covariance": covariance, "rim": np.mean(rims, axis=0), "lone": np.array(lone)}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
         """Return the detector that whitens with the learned covariance and rim instead of the
-        capture's own."""
-        return type(self)(self.settings, learned.get("covariance"), learned.get("rim"))
+        capture's own, and that clips only what the camera shows without damage."""
+        return type(self)(
+            self.settings,
+            learned.get("covariance"),
+            learned.get("rim"),
+            learned.get("lone"),
+        )
 
 
 def _with_missing(cloud: Cloud, evidence: LocalEvidence) -> LocalEvidence:
@@ -383,11 +402,13 @@ class _Scores(NamedTuple):
 
 def _judged(
     residuals: _Residuals,
+    tamed: np.ndarray,
     covariance: np.ndarray,
     rim: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest
-    template's height. ``rim`` (n,): variances that the rim adds to the covariance."""
+    template's height. ``tamed`` (r, c): their values, clipped or not. ``rim`` (n,): variances that
+    the rim adds to the covariance."""
     known = residuals.known
     window_px = templates.window_of(covariance)
     power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
@@ -398,7 +419,6 @@ def _judged(
         templates.worths(power, window_px),
         slots.energies(power, window_px),
     )
-    tamed = _tamed(residuals.values)
     radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
     strong = _strong_findings(residuals.values, tamed, known, noise)
     rest = known & ~grown(strong.core, MARGIN_PX)
@@ -477,11 +497,10 @@ def _strong_findings(
     known: np.ndarray,
     noise: _Noise,
 ) -> _Strong:
-    """Find strong findings among residuals (r, c) in deviations, and among the `_tamed`.
+    """Find strong findings among residuals (r, c) in deviations, as they are and ``tamed``.
 
-    A neighbour's shoulder raises or hides what lies beside it, and a template may peak between two
-    holes. So each loud part is judged by its own highest score, and once the strong ones are
-    removed the rest is judged again, until no part of it is strong."""
+    A template may peak between two holes, so each loud part is judged by its own highest score.
+    What lies beside a stronger part is judged once that one is removed, until no part is strong."""
     core = np.zeros(known.shape, bool)
     signed = np.zeros(known.shape)
     template = np.zeros(known.shape, np.uint8)
@@ -527,14 +546,15 @@ def _cores(
     values: np.ndarray,
     known: np.ndarray,
 ) -> list[_Core]:
-    """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c)
-    above `STRONG` of their sign that is no side lobe, and which fill half of the disc of its
-    template's ``radius_px`` (r, c)."""
+    """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c) of
+    their sign above `STRONG`, and at least `OWN_SHARE` of those of loud parts nearby, whose
+    template, of ``radius_px`` (r, c), has a disc that they fill by half."""
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     smooth = cv2.blur(values * known, (3, 3))
     smooth = smooth / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 0.1)
-    around = cv2.dilate(np.abs(signed), np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
+    loud = grown(loud, 1)
+    nearby = cv2.dilate(np.abs(signed) * loud, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8))
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(loud.astype(np.uint8))
     cores = []
     for number in range(1, count):
         left, top, width, height, area = stats[number].tolist()
@@ -546,7 +566,7 @@ def _cores(
         row, column = np.unravel_index(own.argmax(), own.shape)
         score = float(own[row, column])
         peak = int(top + row), int(left + column)
-        least = max(STRONG, LOBE_SHARE * float(around[peak]))
+        least = max(STRONG, OWN_SHARE * float(nearby[peak]))
         if score <= least or area <= LOUD_SHARE * np.pi * radius_px[peak] ** 2:
             continue
         # quiet pixels between loud ones are not a finding of the other sign

@@ -28,6 +28,7 @@ from detectors.findings.odds import (
     share_of_noise,
 )
 from detectors.interface import Detection, Evidence, MissingReturns
+from detectors.pixels.masks import grown
 from harness.inspection.judging import null_facts
 from harness.vocabulary.geometry import Cloud
 from tests.validation.odds import (
@@ -232,12 +233,15 @@ def test_calls_at_print_are_expected_there() -> None:
         cloud, edges = printed(seed)
         own, found = own_of(cloud)
         marks = marks_of(cloud, own.evidence)
+        near = grown(edges, marks.margin_px)
         assert own.doubts == ()
         assert own.expected - own.at_marks == pytest.approx(1.0, rel=1e-6)
         expected += own.at_marks
         for detection in found:
             at_print = edges.reshape(-1)[detection.pixels].any()
-            assert marks.hold(detection) == at_print
+            # noise may peak beside the print, within its margin
+            is_near = near.reshape(-1)[detection.pixels].any()
+            assert at_print <= marks.hold(detection) <= is_near
             seen += at_print
             away += not at_print
     assert expected > 4.0 * captures

@@ -59,6 +59,19 @@ def test_the_bank_holds_discs_dents_and_slots_coarse_ones_last(window_px: int) -
         assert len(template.image) % 2 == 1
 
 
+def test_a_deep_disc_is_blurred_less_than_by_the_window() -> None:
+    """Variances add: of the disc, drawn from quarters of pixels, of the pixel and of the blur."""
+    (deep,) = [
+        template
+        for template in bank(3)
+        if template.radius_px == DEEP_PX and template.halves == (0, 0)
+    ]
+    half = len(deep.image) // 2
+    offsets_px = np.arange(-half, half + 1)
+    variance_px2 = (deep.image.sum(axis=0) * offsets_px**2).sum() / deep.image.sum()
+    assert variance_px2 == pytest.approx(DEEP_PX**2 / 4 + 0.9**2 + 1 / 12, rel=0.06)
+
+
 def of_radius(radius_px: float, window_px: int = 5) -> list[Template]:
     return [template for template in bank(window_px) if template.radius_px == radius_px]
 

@@ -43,7 +43,9 @@ def test_findings_carry_the_odds_of_the_captures_own_null() -> None:
     assert stated == list(result.noise_probabilities)
     assert min(stated) < 0.05
     assert max(stated) > 0.5
-    assert stated == sorted(stated)
+    # of those on one side of the surface, a stronger one is not more likely noise
+    behind = [finding.noise_probability for finding in result.findings if finding.kind == "hole"]
+    assert behind == sorted(behind)
 
 
 def test_odds_are_unknown_where_the_threshold_is_given() -> None:
