@@ -4,8 +4,7 @@ Simulated studies draw hits at evenly spread sizes of 0.5 to 10 mm from known cu
 tail t covers the true a90 where the weight of curves with a larger a90 is at least t, so that one
 pass shows the coverage of every tail. The tail of a number of targets is the largest with which
 coverage is at least `MEAN` on average over `CURVES` and `LEAST` for each. With ``--unused``,
-coverage and bound of the library's tails are printed for curves and sizes that set nothing; with
-``--ends``, the coverage of both ends of intervals of a50 and a90 for `CURVES`.
+coverage and bound of the library's tails are printed for curves and sizes that set nothing.
 
 The likelihoods of all studies are taken on one grid; ``tests/harness/evaluation/pod/
 test_pod_averaged.py`` compares them with the library's.
@@ -24,14 +23,7 @@ import numpy as np
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.evaluation.pod.averaged import (
-    END,
-    NARROWEST,
-    WIDEST,
-    curves_of,
-    log_weights,
-    tail_of,
-)
+from harness.evaluation.pod.averaged import NARROWEST, WIDEST, curves_of, log_weights, tail_of
 from harness.evaluation.pod.curve import LINKS, PodCurve, link_ppf, logs_of_link
 from harness.evaluation.pod.hit_miss import NEAR_DEVIANCE, criterion
 
@@ -82,17 +74,17 @@ UNUSED = (
 
 @dataclass(frozen=True, eq=False)
 class Studies:
-    """Weights of curves by their size with one POD, of several simulated studies."""
+    """Weights of curves by a90, of several simulated studies."""
 
     sizes_mm: np.ndarray
-    """Size (m,) with this POD on the curves, ascending."""
+    """a90 (m,) of the curves, ascending."""
     weight: np.ndarray
     """Their weights (s, m); the sum of each study is 1."""
     constant: np.ndarray
     """Whether (s,) a constant probability is not rejected."""
 
     def beyond(self, size_mm: float) -> np.ndarray:
-        """Return the weight (s,) of curves with a larger size; 1 where nothing is demonstrated."""
+        """Return the weight (s,) of curves with a larger a90; 1 where nothing is demonstrated."""
         beyond = self.weight[:, self.sizes_mm > size_mm].sum(axis=1)
         return np.where(self.constant, 1.0, beyond)
 
@@ -104,11 +96,7 @@ class Studies:
 
 
 def weighted(
-    sizes_mm: np.ndarray,
-    hits: np.ndarray,
-    middles: int = 72,
-    widths: int = 28,
-    pod: float = 0.9,
+    sizes_mm: np.ndarray, hits: np.ndarray, middles: int = 72, widths: int = 28
 ) -> Studies:
     """Weigh curves by the hits (s, n) of studies with the same sizes (n,)."""
     targets = len(sizes_mm)
@@ -117,7 +105,7 @@ def weighted(
     found = hits.astype(np.float32)
     values = []
     cells = []
-    sizes_at_pod_mm = []
+    a90_mm = []
     for log_size, link in product((False, True), LINKS):
         x = np.log(sizes_mm) if log_size else sizes_mm
         range_x = float(np.ptp(x))
@@ -132,9 +120,9 @@ def weighted(
         log_miss = np.maximum(log_miss, -1e6).astype(np.float32)
         values.append(found @ log_hit + (1 - found) @ log_miss)
         cells.append(log_weights(all_widths, targets))
-        x_at_pod = mu + sigma * float(link_ppf(link, np.array(pod)))
+        x90 = mu + sigma * float(link_ppf(link, np.array(0.9)))
         with np.errstate(over="ignore"):
-            sizes_at_pod_mm.append(np.exp(x_at_pod) if log_size else x_at_pod)
+            a90_mm.append(np.exp(x90) if log_size else x90)
     deviance = np.array([-2.0 * value.max(axis=1) for value in values])
     near = deviance <= deviance.min(axis=0) + NEAR_DEVIANCE
     top = np.max([value.max(axis=1) for value in values], axis=0)
@@ -142,7 +130,7 @@ def weighted(
     for value, cell, is_near in zip(values, cells, near, strict=True):
         weights.append(np.exp(value - top[:, None] + cell) * is_near[:, None])
     weight = np.concatenate(weights, axis=1)
-    sizes = np.concatenate(sizes_at_pod_mm)
+    sizes = np.concatenate(a90_mm)
     order = np.argsort(sizes, kind="stable")
     share = hits.mean(axis=1)
     null = -2.0 * targets * (share * np.log(share) + (1 - share) * np.log1p(-share))
@@ -174,25 +162,6 @@ def coverage(targets: int, studies: int, seed: int = 1) -> np.ndarray:
     return np.array(rows)
 
 
-def print_ends(targets: int, studies: int) -> None:
-    """Print how often each end of intervals of a50 and a90 covers, on average and least."""
-    random = np.random.default_rng([3, targets])
-    sizes_mm = np.linspace(0.5, 10.0, targets)
-    for pod in (0.5, 0.9):
-        low = []
-        high = []
-        for curve in CURVES:
-            judged = weighted(sizes_mm, drawn(curve, sizes_mm, studies, random), pod=pod)
-            beyond = judged.beyond(curve.size_at(pod))
-            low.append(float((beyond <= 1.0 - END).mean()))
-            high.append(float((beyond >= END).mean()))
-        print(
-            f"{targets:4d} targets, POD {pod}: low end mean {np.mean(low):.3f} least "
-            f"{min(low):.2f}, high end mean {np.mean(high):.3f} least {min(high):.2f}",
-            flush=True,
-        )
-
-
 def print_unused(targets: int, studies: int) -> None:
     """Print coverage and bounds for curves that set nothing, at even and at random sizes."""
     random = np.random.default_rng([2, targets])
@@ -220,12 +189,8 @@ def main() -> None:
     parser.add_argument("--studies", type=int, default=400)
     parser.add_argument("--targets", type=int, nargs="+", default=TARGETS)
     parser.add_argument("--unused", action="store_true", help="curves that set nothing")
-    parser.add_argument("--ends", action="store_true", help="ends of intervals of a50 and a90")
     wanted = parser.parse_args()
     for targets in wanted.targets:
-        if wanted.ends:
-            print_ends(targets, wanted.studies)
-            continue
         if wanted.unused:
             print_unused(targets, wanted.studies)
             continue

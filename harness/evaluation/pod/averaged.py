@@ -9,13 +9,11 @@ and scale, these are the weights whose quantiles cover as stated: Datta and Ghos
 1357.) The spacing matters where hits and misses do not overlap: such data do not bound a curve's
 steepness. The bound is the size at which the weight of curves with a larger a90 falls to a tail.
 
-The tail of the bound is calibrated (C): by the number of targets, it is the largest with which the
-bound covers the true a90 in at least 97 % of simulated studies on average over 20 curves, steep
-and flat, and in 90 % for every curve (``tests/validation/pod_levels.py``, which also measures
-curves and sizes that set nothing). An interval leaves the weight `END` (C) beyond each of its ends,
-each of which covers 97 % on average over these curves and numbers of targets (``--ends``). Not
-modelled: a curve with floor or ceiling; a width above the range of the sizes is covered less
-often."""
+The tail is calibrated (C): by the number of targets, it is the largest with which the bound
+covers the true a90 in at least 97 % of simulated studies on average over 20 curves, steep and
+flat, and in 90 % for every curve (``tests/validation/pod_levels.py``, which also measures curves
+and sizes that set nothing). Not modelled: a curve with floor or ceiling; a width above the range
+of the sizes is covered less often."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +21,6 @@ from functools import cached_property
 
 import numpy as np
 
-from harness.evaluation.intervals import Interval
 from harness.evaluation.pod.curve import CELLS, Bound, link_cdf, link_ppf
 from harness.evaluation.pod.hit_miss import HitMissFit, criterion
 
@@ -42,8 +39,6 @@ TAILS = {
     100: 0.02,
 }
 """Tail by number of targets; in between, linear in the logarithm of the number."""
-END = 0.02
-"""Weight beyond each end of an interval."""
 MIDDLES = 40
 WIDTHS = 32
 ZOOMS = 5  # most grids, each narrowed to the curves that matter in the one before
@@ -91,21 +86,15 @@ class WeightedCurves:
 
 @dataclass(frozen=True, eq=False)
 class ModelAverage:
-    """The curves of models that were fitted to the same hits.
-
-    ``design_effect``: factor of the variance for targets in clusters; it divides the
-    log-likelihoods, as the number of inspections of a target does (Rao and Scott, Annals of
-    Statistics 12 (1984), 46)."""
+    """The curves of models that were fitted to the same hits."""
 
     fits: Sequence[HitMissFit]
     """The models."""
-    design_effect: float = 1.0
-    """Variance with clusters over that without."""
 
     @cached_property
     def curves(self) -> WeightedCurves:
         """The curves whose weight is not negligible."""
-        grids = [_narrowed(fit, self.design_effect) for fit in self.fits]
+        grids = [_narrowed(fit) for fit in self.fits]
         largest = max(float(log_weight.max()) for _, _, log_weight in grids)
         models = []
         kept_mu = []
@@ -143,17 +132,6 @@ class ModelAverage:
         value = max(value, self.fits[0].curve.size_at(pod))
         return Bound(pod, CONFIDENCE, METHOD, value)
 
-    def interval(self, pod: float) -> Interval:
-        """Return the central 95 % interval of the size with this POD, which contains that of the
-        first model's curve; without an upper end where a constant probability is not rejected."""
-        sizes = self.curves.sizes_at(pod)
-        low = weighted_quantile(sizes, self.curves.weight, END)
-        high = weighted_quantile(sizes, self.curves.weight, 1.0 - END)
-        if self._constant():
-            high = float("inf")
-        estimate = self.fits[0].curve.size_at(pod)
-        return Interval(min(low, estimate), max(high, estimate))
-
     def band(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: a curve's
         POD at a size is below 90 % where its a90 is larger, so that the lower edge crosses 90 % at
@@ -169,7 +147,7 @@ class ModelAverage:
     def _constant(self) -> str:
         """Return why a constant probability is not rejected; empty if it is."""
         fit = min(self.fits, key=lambda fit: fit.deviance)
-        ratio = (fit.null_deviance - fit.deviance) / fit.repeats / self.design_effect
+        ratio = (fit.null_deviance - fit.deviance) / fit.repeats
         allowed = criterion(CONFIDENCE)
         if ratio > allowed:
             return ""
@@ -206,7 +184,7 @@ def curves_of(link: str, middle: np.ndarray, width: np.ndarray) -> tuple[np.ndar
     return middle - sigma * half, sigma
 
 
-def _narrowed(fit: HitMissFit, design_effect: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _narrowed(fit: HitMissFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mu, sigma and the logarithm of the weight of a model's curves on a grid that covers
     those that matter."""
     z = fit.data.z
@@ -221,7 +199,7 @@ def _narrowed(fit: HitMissFit, design_effect: float) -> tuple[np.ndarray, np.nda
         middle, log_width = (grid.ravel() for grid in np.meshgrid(middles, log_widths))
         width = np.exp(log_width)
         mu, sigma = curves_of(fit.curve.link, middle, width * range_z)
-        log_likelihood = _log_likelihoods(fit, mu, sigma) / fit.repeats / design_effect
+        log_likelihood = _log_likelihoods(fit, mu, sigma) / fit.repeats
         log_weight = log_likelihood + log_weights(width, targets)
         matters = log_weight > log_weight.max() - NEGLIGIBLE
         narrower_middle = _ends_of(middle[matters], middles)

@@ -40,6 +40,9 @@ class Targets:
     excess: np.ndarray | None = None
     """If each inspection is a row: its signal (n,) above the threshold, in standard errors of the
     threshold; infinite for a damage that is found at any threshold."""
+    threshold: float = np.nan
+    """The threshold: equal ones are drawn again alike, as from one calibration, and others
+    independently."""
 
 
 def targets_of(
@@ -114,7 +117,7 @@ def refitted_sizes(
     if targets.unit is not None:
         rows.append((targets.unit, "units"))
     sizes = []
-    stream = random_stream(0, "thresholds drawn again")
+    stream = random_stream(0, "thresholds drawn again", f"{targets.threshold:.5g}")
     for weights in weights_in_blocks(draws, *rows):
         product = np.multiply.reduce(weights)
         hits = hits_at(targets, stream.standard_normal(len(product)))
@@ -235,8 +238,6 @@ def units_effect(rows: Targets, curve: PodCurve, pod: float) -> float:
 
     The variances of boards and of units add up, less that of their combinations, which both
     contain (Cameron, Gelbach and Miller, J. Business & Economic Statistics 29 (2011), 238)."""
-    if rows.unit is None:
-        return 1.0
     influence = _influence(rows, curve, pod)
     _, board = np.unique(rows.board, return_inverse=True)
     _, unit = np.unique(rows.unit, return_inverse=True)

@@ -2,11 +2,11 @@
 
 The quoted limit is the bound of the hit/miss curves that fit about equally well, averaged
 (`harness.evaluation.pod.averaged`). It takes damages as independent targets, which damages of one
-board are not quite; so a second bound divides their log-likelihoods by the boards' design effect.
-The intervals of a50 and a90 are of the same averages, with the design effects of a50 and a90.
-Percentiles over resampled boards do not replace either: with few targets or boards that differ
-they cover in 72 to 93 % of studies. Resampled boards serve comparisons, in which what two set-ups
-share cancels. ``tofpod audit`` measures how often all of these cover."""
+board are not quite; so a second bound, and the intervals of a50 and a90, are of curves that are
+shifted from board to board (`harness.evaluation.pod.clustered`). Percentiles over resampled boards
+do not replace them: with few targets, flat curves or boards that differ they cover in 72 to 93 %
+of studies. Resampled boards serve comparisons, in which what two set-ups share cancels.
+``tofpod audit`` measures how often all of these cover."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from harness.evaluation.intervals import (
     false_call_rate,
     percentiles,
 )
-from harness.evaluation.pod.averaged import ModelAverage
+from harness.evaluation.pod.clustered import ClusterAverage
 from harness.evaluation.pod.curve import Bound
 from harness.evaluation.pod.hit_miss import METHOD
 from harness.evaluation.pod.inspections import Inspections
@@ -78,7 +78,7 @@ class SetUpLimit:
     a90_interval_mm: Interval
     """95 % interval of a90, likewise."""
     over_boards: Bound
-    """a90/95 with the measured similarity of damages of one board."""
+    """a90/95 with damages of one board as alike as they are found to be."""
     design_effect: float
     """Variance of a90 with boards as units over that with damages as units; NaN if unknown."""
     boards: int
@@ -240,9 +240,12 @@ def _sizes_of_curve(
             inspections=np.ones(len(inspected.hit)),
             unit=unit if record.units > 1 else None,
             excess=excess,
+            threshold=record.threshold,
         )
     (a90_draws_mm,) = np.maximum(refitted_sizes(rows, statement.curve, (POD,), draws), 0.0)
-    over_boards, effect = _over_boards(statement, targets)
+    assert statement.average is not None  # only a model that a user states has none
+    clustered = ClusterAverage(statement.average, inspected.board)
+    over_boards = clustered.bound(POD)
     margin = ONE_SIDED * size_per_error(rows, statement.curve, POD)
     over_boards = _with_margin(over_boards, statement.a90, margin)
     units: OverUnits | None = None
@@ -262,23 +265,23 @@ def _sizes_of_curve(
         a90_mm=statement.a90,
         a90_draws_mm=a90_draws_mm,
         over_boards=over_boards,
-        a50_interval_mm=_interval(statement, targets, rows, 0.5),
-        a90_interval_mm=_interval(statement, targets, rows, POD),
-        design_effect=effect,
+        a50_interval_mm=_interval(clustered, rows, 0.5),
+        a90_interval_mm=_interval(clustered, rows, POD),
+        design_effect=_effect_of_boards(statement, targets),
         over_units=units,
     )
 
 
-def _interval(statement: PodStatement, targets: Targets, rows: Targets, pod: float) -> Interval:
-    """Return the 95 % interval of the size with this POD: that of the averaged models with the
-    effects of boards and units, joined with the threshold's as in `_with_margin`."""
-    effect = 1.0
-    if statement.fits[0].method == "ML":
-        effect = max(design_effect(targets, statement.curve, pod), 1.0)
-        effect *= units_effect(rows, statement.curve, pod)
-    interval = ModelAverage(statement.fits, effect).interval(pod)
-    estimate = statement.curve.size_at(pod)
-    margin = TWO_SIDED * size_per_error(rows, statement.curve, pod)
+def _interval(clustered: ClusterAverage, rows: Targets, pod: float) -> Interval:
+    """Return the 95 % interval of the size with this POD, wider by what units add, and joined with
+    the threshold's as in `_with_margin`."""
+    first = clustered.average.fits[0]
+    curve = first.curve
+    if rows.unit is not None and first.method == "ML":
+        clustered = replace(clustered, effect=units_effect(rows, curve, pod))
+    interval = clustered.interval(pod)
+    estimate = curve.size_at(pod)
+    margin = TWO_SIDED * size_per_error(rows, curve, pod)
     if not margin or not interval.low > 0:
         return Interval(max(interval.low, 0.0), max(interval.high, 0.0))
     below = np.hypot(np.log(estimate / interval.low), margin)
@@ -310,15 +313,11 @@ def _with_margin(bound: Bound, a90: float, margin: float) -> Bound:
     return replace(bound, value=a90 * float(np.exp(np.hypot(of_hits, margin))))
 
 
-def _over_boards(statement: PodStatement, targets: Targets) -> tuple[Bound, float]:
-    """Return a90/95 with the curve's design effect, which divides the log-likelihoods, and that
-    effect; one below 1 counts as 1. Separated data have none."""
+def _effect_of_boards(statement: PodStatement, targets: Targets) -> float:
+    """Return the curve's design effect at a90; NaN for separated data."""
     if statement.fits[0].method != "ML":
-        return statement.bound, np.nan
-    effect = design_effect(targets, statement.curve, POD)
-    if effect > 1:
-        return ModelAverage(statement.fits, effect).bound(POD), effect
-    return statement.bound, effect
+        return np.nan
+    return design_effect(targets, statement.curve, POD)
 
 
 def _sizes_if_all_found(targets: Targets, draws: int) -> _Sizes:

@@ -1,7 +1,7 @@
 """Comparison of two set-ups by hits, a90, signals and false calls. Boards are the units, because
-damages of one board share its render, its pose and its surface. The tests of hits and limits
-ignore that each set-up drew its own calibration of the threshold; those of signals and false calls
-do not. The first of two p-values means worse."""
+damages of one board share its render, its pose and its surface. The test of hits ignores that each
+set-up drew its own calibration of the threshold; those of limits, signals and false calls do not.
+The first of two p-values means worse."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -22,9 +22,9 @@ from harness.vocabulary.seeds import canonical_json
 # better
 MARGIN = 1.10
 ALPHA = 0.001
-"""Level of a gate's tests, for a whole comparison. It is low because no test over boards includes
-the scatter of each set-up's calibration of the threshold; `tofpod check` says how often the rule
-fails because of it."""
+"""Level of a gate's tests, for a whole comparison. It is low because the test of hits does not
+include the scatter of each set-up's calibration of the threshold; `tofpod check` says how often the
+rule fails because of it."""
 QUESTIONS = 3  # the questions about a set-up: its limit, false calls and signals
 
 Mark = Literal[

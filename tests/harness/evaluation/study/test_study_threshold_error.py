@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.study.boards import Targets, hits_at, size_per_error
+from harness.evaluation.study.boards import Targets, hits_at, refitted_sizes, size_per_error
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import SetUpRecord, ThresholdError
 from harness.tables.study import THRESHOLDS
@@ -99,6 +99,30 @@ def test_interval_and_bound_contain_the_thresholds_error() -> None:
     assert with_error.a90_95.value > 1.02 * without.a90_95.value
     assert with_error.over_boards.value > 1.02 * without.over_boards.value
     assert with_error.a90_mm == without.a90_mm
+
+
+def test_equal_thresholds_are_drawn_again_alike_and_others_independently() -> None:
+    """So a change of a90 contains the errors of both calibrations, but none of a shared one."""
+    record = at(THRESHOLD, ERROR)
+    curve = PodCurve("logit", False, 6.0, 0.8, np.zeros((2, 2)))
+    rows = dataclasses.replace(rows_of(record), threshold=5.0)
+    first = refitted_sizes(rows, curve, (0.9,), 200)[0]
+    again = refitted_sizes(rows, curve, (0.9,), 200)[0]
+    other = refitted_sizes(dataclasses.replace(rows, threshold=5.1), curve, (0.9,), 200)[0]
+    fixed = dataclasses.replace(rows, excess=None)
+    of_boards = refitted_sizes(fixed, curve, (0.9,), 200)[0]
+    assert np.array_equal(first, again)
+    # what the thresholds add to the boards' draws
+    added = np.log(first / of_boards)
+    added_to_other = np.log(other / of_boards)
+    known = np.isfinite(added) & np.isfinite(added_to_other)
+    assert abs(np.corrcoef(added[known], added_to_other[known])[0, 1]) < 0.25
+    assert np.std(added[known]) == pytest.approx(ERROR / SIGNAL_PER_MM / 7.76, rel=0.4)
+    assert limit_of(record, draws=200).a90_draws_mm == pytest.approx(
+        np.maximum(
+            refitted_sizes(rows, limit_of(record, draws=2).statement.curve, (0.9,), 200)[0], 0
+        )
+    )
 
 
 def test_found_by_missing_returns_is_found_at_any_threshold() -> None:
