@@ -159,7 +159,7 @@ def test_a_design_survives_json():
     assert adapter.validate_python(json.loads(text)) == design
 
 
-def test_chosen_sizes_quote_the_bound_with_the_design_effect():
+def test_chosen_sizes_quote_the_bound_over_boards():
     (record,) = study_record(Study(boards=30, set_ups=(SetUp(boards_mm=1.5),))).set_ups
     plain = limit_of(record, draws=20)
     chosen = limit_of(replace(record, sizes_chosen=True), draws=20)
