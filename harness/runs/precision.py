@@ -18,14 +18,7 @@ from harness.experiment.schema import Experiment, Point, PrecisionConfig, StudyC
 from harness.runs.job_batches import values_of
 from harness.runs.jobs import Ended, JobEngine, Outcome
 from harness.runs.journal import DESIGNS, JOURNAL_VERSION, Journal
-from harness.runs.plan import (
-    PACKAGES,
-    Designs,
-    SweepPlan,
-    family_of,
-    plan_of,
-    trial_code,
-)
+from harness.runs.plan import PACKAGES, Designs, SweepPlan, family_of, plan_of, trial_code
 from harness.runs.shards import Shard
 from harness.runs.study_record import set_up_record
 from harness.runs.tables import tables_of
@@ -142,8 +135,11 @@ class Batches:
             if record is not None:
                 records[point.digest] = record
         arguments = [(record,) for record in records.values()]
-        limits = values_of(limit_of, arguments, engine)
-        return dict(zip(records, limits, strict=True))
+        limits = {}
+        for name, limit in zip(records, values_of(limit_of, arguments, engine), strict=True):
+            # a process that was lost costs no batch
+            limits[name] = limit or limit_of(records[name])
+        return limits
 
 
 def _stored_design(design: BoardDesign, points: list[Point], journal: Journal) -> BoardDesign:

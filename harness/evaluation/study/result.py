@@ -192,8 +192,8 @@ def _precision(record: StudyRecord) -> tuple[str, ...]:
         return ()
     sentences = [design.sentence for design in record.designs]
     sentences.append(
-        "a90/95 is that with the boards' design effect, since damages of chosen sizes on one board "
-        "tend to be found or missed together."
+        "a90/95 is the bound over boards: damages of chosen sizes on one board tend to be found or "
+        "missed together."
     )
     sentences.append(
         "Shares over all damages, such as the ROC, are those of these sizes; they lie higher or "

@@ -61,6 +61,7 @@ def test_the_record_states_the_boards_and_why_there_are_no_more(whole):
 def test_page_and_terminal_state_the_precision(whole):
     page = (results(whole / "out") / "report.html").read_text()
     assert "a90 wanted to 0.05 mm, not reached with 11 boards" in page
+    assert page.count("No more boards: all 11 boards that are allowed were used") == 1
     shown = (whole / "shown.txt").read_text()
     assert "at most 0.05 mm wide" in shown
     assert "No more boards: all 11 boards that are allowed were used" in shown
