@@ -421,22 +421,10 @@ class AmcwImager(UnitModel[AmcwCamera]):
         Returns:
             A frame of n pixels (n,).
         """
-        n = saturated.size
-        z_m, reason, total = ranging.ranges_of(
-            filtered, edge, saturated, engine, np.full(n, error_m)
-        )
+        z_m, reason, total = ranging.ranges_of(filtered, edge, saturated, engine, error_m)
         if engine.flying is not None:
-            flying = np.empty((n, 1), bool)
-            ranging.find_flying(
-                z_m[:, None],
-                total[:, None],
-                reason[:, None],
-                np.arange(n),
-                neighbours,
-                engine.flying,
-                flying,
-            )
-            reason[flying[:, 0]] = ranging.EDGE
+            flying = ranging.find_flying(z_m, total, reason, neighbours, engine.flying)
+            reason[flying] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
         return DecodedFrame(z_m, reason, total / f4(len(filtered)))
 
