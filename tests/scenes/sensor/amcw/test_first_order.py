@@ -61,8 +61,8 @@ class Frames(NamedTuple):
 
 
 def numbers_of(name: str) -> dict[str, float]:
-    """A Kinect v2 with a finer converter: by its own, dark pixels' noise hides no steps and frames
-    are drawn singly."""
+    """A Kinect v2 with a finer converter: by its own, dark pixels' noise hides no steps, so that
+    all of them are listed."""
     return (
         {"photons.electrons_per_unit": 3.0, "scatter.blur_px": 0.0}
         if name.startswith("kinect")
@@ -534,6 +534,18 @@ def test_pixels_that_may_saturate_are_listed():
     saturated = (whole.reason == Reason.SATURATED).mean(axis=0)
     assert ((saturated > 0.01) & (saturated < 0.99)).sum() > 20
     assert_alike(unit, whole, drawn)
+
+
+def test_pixels_whose_noise_hides_no_steps_of_the_converter_are_listed():
+    """Those far behind a hole before a Kinect v2."""
+    name = "kinect_v2_libfreenect2"
+    config = CameraConfig(name=name, effects=STILL)
+    unit = SimulatedUnit(camera_of(config), config, unit_before_hole(name, 200.0).view)
+    model = unit.first_order
+    assert model is not None
+    listed = np.isin(np.arange(np.prod(model.shape)), model.listed.pixels).reshape(model.shape)
+    assert listed[unit.cut][groups_of(unit)["floor"]].all()
+    assert_alike(unit, *frames_before(unit))
 
 
 def test_what_no_model_draws_goes_through_the_whole_chain():
