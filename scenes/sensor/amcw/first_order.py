@@ -31,7 +31,7 @@ from scenes.sensor.common.unit import DecodedFrame
 f4 = np.float32
 RADIANS_PER_TURN = f4(2 * np.pi)
 # if more of the pixels had to go through the whole chain, whole frames would cost less
-MOST_LISTED = 0.5
+MOST_LISTED = 0.3
 # from this noise of a sample over the converter's step, rounding is noise of step^2/12, to 1e-3
 LEAST_DITHER = 0.6
 JITTERS = 6.0  # limits of range keep this many deviations of a frame's displacement away
@@ -78,7 +78,7 @@ def first_order(
     n = exposure.sigma.size
     side = len(window.space)
     unfit = pixels_within(_unfit(imager, exposure).reshape(shape), side)
-    if unfit[wanted].mean() > MOST_LISTED:
+    if (unfit | imager.outside_mask)[wanted].mean() > MOST_LISTED:
         return None
 
     # each wanted pixel after the filter, and its change by noise

@@ -36,7 +36,10 @@ from scenes.sensor.source import WHOLE_FRAMES, SimulatedUnit
 REGIONS = {
     "azure_kinect_nfov": Region(306, 338, 296, 352),
     "kinect_v2_libfreenect2": Region(196, 228, 226, 282),
+    "pmd_flexx2": Region(70, 102, 84, 140),
 }
+FILTERING = ["azure_kinect_nfov", "kinect_v2_libfreenect2"]
+"""Cameras with a window; without one, no pixel before a hole is doubtful."""
 STILL = EffectsConfig(frame_jumps=False)
 FRONT = Plane(0.7, 0.08, 0.05)
 NOTHING_BEHIND_M = 8.0
@@ -348,7 +351,7 @@ def differences(whole: np.ndarray, drawn: np.ndarray, least_error: float) -> np.
     return (whole.mean(axis=0) - drawn.mean(axis=0)) / error
 
 
-@pytest.mark.parametrize("name", REGIONS)
+@pytest.mark.parametrize("name", FILTERING)
 def test_single_pixels_agree_in_mean_and_in_how_often_they_have_a_range(name: str):
     """At a hole before 200 mm: the largest difference of thousands."""
     whole, drawn = frames_of(name, 200.0)
@@ -496,7 +499,7 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
         assert abs(compared(whole[:, column] > limit, drawn[:, column] > limit)) < 4
 
 
-@pytest.mark.parametrize("name", REGIONS)
+@pytest.mark.parametrize("name", FILTERING)
 def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     """A reading of the whole picture: the list's result is that of the picture, bit for bit."""
     unit = unit_before_hole(name, 200.0)
@@ -524,7 +527,7 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
 
 def test_pixels_that_may_saturate_are_listed():
     """A converter that ends in the midst of the plate's samples."""
-    config = CameraConfig(effects=STILL, numbers={"converter.full_scale_units": 860})
+    config = CameraConfig(effects=STILL, numbers={"converter.full_scale_units": 890})
     camera = camera_of(config)
     view = plane_view(camera, Region(300, 332, 300, 356), 0.7, 0.6, 0.6, 0.2)
     unit = SimulatedUnit(camera, config, view)
