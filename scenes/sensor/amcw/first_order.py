@@ -22,7 +22,7 @@ from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw.certainty import Certainty, certainty
 from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.imager import AmcwImager, Reading
+from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
 from scenes.sensor.amcw.light import Light, light_of_samples
 from scenes.sensor.amcw.linear import DEVIATIONS, Moves, linearised, unknown_filtered
 from scenes.sensor.amcw.linear_frames import TOGETHER, Linear, draw_linear_frame
@@ -298,7 +298,7 @@ class FirstOrder:
         shape = self.shape
         return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude.reshape(shape))
 
-    def _normals_of(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+    def _normals_of(self, reading: NoisyLight) -> tuple[np.ndarray, np.ndarray]:
         """Return the normals (g,) of the phases and of the amplitudes of the list's halo."""
         noise = self.halo_noise
         g = len(self.listed.halo)

@@ -148,7 +148,7 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     return np.asarray(1 / np.abs(ux * vy - uy**2))
 
 
-class Reading(NamedTuple):
+class NoisyLight(NamedTuple):
     """Light of n pixels with noise, before the filter."""
 
     unit: np.ndarray
@@ -366,7 +366,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             amplitude=decoded.amplitude.reshape(shape),
         )
 
-    def reading(self, exposure: AmcwExposure, rng: np.random.Generator) -> Reading:
+    def reading(self, exposure: AmcwExposure, rng: np.random.Generator) -> NoisyLight:
         """Draw a noisy reading of an exposure."""
         n_frequencies, _, n = exposure.means.shape
         unit = np.empty((2, n_frequencies, n), f4)
@@ -385,7 +385,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             amplitude,
             saturated,
         )
-        return Reading(unit, amplitude, saturated)
+        return NoisyLight(unit, amplitude, saturated)
 
     def filter(
         self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]

@@ -25,7 +25,7 @@ from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor import source
 from scenes.sensor.amcw import first_order, kernels
 from scenes.sensor.amcw.facts import AmcwCamera, ExposuresFacts
-from scenes.sensor.amcw.imager import AmcwImager, Reading
+from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
 from scenes.sensor.amcw.light import light_of_samples
 from scenes.sensor.amcw.listed import decoded
 from scenes.sensor.camera import camera_of
@@ -517,7 +517,7 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     reading = imager.reading(unit.exposure, random_stream(1))
     whole = imager.frame(unit.exposure, random_stream(1), 0.002)
     # the last one stands for what is beyond the picture
-    of_list = Reading(
+    of_list = NoisyLight(
         unit=np.pad(reading.unit[..., listed.halo], ((0, 0), (0, 0), (0, 1))),
         amplitude=np.pad(
             reading.amplitude[:, listed.halo], ((0, 0), (0, 1)), constant_values=kernels.OUTSIDE
