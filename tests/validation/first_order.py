@@ -96,13 +96,12 @@ def row(pixels: np.ndarray, whole: np.ndarray, first_order: np.ndarray) -> str:
     always = pixels & valid
     if not always.any():
         return f"{pixels.sum():6d} | no pixel has a range in every frame"
-    variances = []
-    beyond = []
+    noises = []
     for frames in (whole, first_order):
-        noise = frames[:, :, always] - frames[:, :, always].mean(axis=1, keepdims=True)
-        variances.append((noise**2).mean(axis=1))
-        deviation = np.sqrt(variances[0][0])
-        beyond.append((np.abs(noise[0]) > 3 * deviation).mean())
+        noises.append(frames[:, :, always] - frames[:, :, always].mean(axis=1, keepdims=True))
+    variances = [(noise**2).mean(axis=1) for noise in noises]
+    deviation = np.sqrt((variances[0][0] + variances[1][0]) / 2)
+    beyond = [(np.abs(noise[0]) > 3 * deviation).mean() for noise in noises]
     ratio_of_z, ratio_of_amplitude = np.median(variances[1] / variances[0], axis=1)
     lags = []
     pairs = zip(correlations(whole[0], always), correlations(first_order[0], always), strict=True)

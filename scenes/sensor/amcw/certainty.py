@@ -79,7 +79,7 @@ def certainty(
 
     # the engine on the mean phasors
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1)
-    z_m, _, _ = ranging.ranges_of(planes, filtered.edge, np.zeros(n, np.uint8), engine, np.zeros(n))
+    z_m, _, _ = ranging.ranges_of(planes, filtered.edge, np.zeros(n, np.uint8), engine, 0.0)
     # change of z by half a path: the range is that at which range and distance to the emitter come
     # to twice as much
     along, square, cosine = engine.geometry

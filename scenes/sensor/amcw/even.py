@@ -62,11 +62,11 @@ def even_pixels(
     lowest = light.amplitude * (1 - DEVIATIONS * light.relative_noise)
     unlike = (lowest <= window.dim).any(axis=0)
     unlike |= (light.phase_noise > LARGEST_NOISE).any(axis=0)
-    even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
-    even[:half] = False
-    even[-half:] = False
-    even[:, :half] = False
-    even[:, -half:] = False
+    like = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
+    h, w = shape
+    inner = (slice(half, h - half), slice(half, w - half))
+    even = np.zeros(shape, bool)
+    even[inner] = like[inner]
     for f, noise in enumerate(light.phase_noise):
         loss = window.concentration * noise.reshape(shape) ** 2
         difference = np.asarray(cv2.dilate(loss, square)) - np.asarray(cv2.erode(loss, square))

@@ -148,7 +148,7 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     return np.asarray(1 / np.abs(ux * vy - uy**2))
 
 
-class SensorReading(NamedTuple):
+class NoisyLight(NamedTuple):
     """Light of n pixels with noise, before the filter."""
 
     unit: np.ndarray
@@ -366,7 +366,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             amplitude=decoded.amplitude.reshape(shape),
         )
 
-    def reading(self, exposure: AmcwExposure, rng: np.random.Generator) -> SensorReading:
+    def reading(self, exposure: AmcwExposure, rng: np.random.Generator) -> NoisyLight:
         """Draw a noisy reading of an exposure."""
         n_frequencies, _, n = exposure.means.shape
         unit = np.empty((2, n_frequencies, n), f4)
@@ -385,7 +385,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             amplitude,
             saturated,
         )
-        return SensorReading(unit, amplitude, saturated)
+        return NoisyLight(unit, amplitude, saturated)
 
     def filter(
         self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]
@@ -421,22 +421,10 @@ class AmcwImager(UnitModel[AmcwCamera]):
         Returns:
             A frame of n pixels (n,).
         """
-        n = saturated.size
-        z_m, reason, total = ranging.ranges_of(
-            filtered, edge, saturated, engine, np.full(n, error_m)
-        )
+        z_m, reason, total = ranging.ranges_of(filtered, edge, saturated, engine, error_m)
         if engine.flying is not None:
-            flying = np.empty((n, 1), bool)
-            ranging.find_flying(
-                z_m[:, None],
-                total[:, None],
-                reason[:, None],
-                np.arange(n),
-                neighbours,
-                engine.flying,
-                flying,
-            )
-            reason[flying[:, 0]] = ranging.EDGE
+            flying = ranging.find_flying(z_m, total, reason, neighbours, engine.flying)
+            reason[flying] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
         return DecodedFrame(z_m, reason, total / f4(len(filtered)))
 

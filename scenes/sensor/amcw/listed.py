@@ -12,7 +12,7 @@ import numpy as np
 
 from scenes.sensor.amcw import kernels
 from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.imager import AmcwImager, SensorReading
+from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
 from scenes.sensor.amcw.ranging import DepthEngine
 from scenes.sensor.amcw.windows import pixels_within, windows_of
 from scenes.sensor.common.unit import DecodedFrame
@@ -100,7 +100,9 @@ def _strips(
     return padded_numbers.ravel()[upper + below], places[padded] - half
 
 
-def decoded(listed: Listed, imager: AmcwImager, reading: SensorReading, error_m: float) -> DecodedFrame:
+def decoded(
+    listed: Listed, imager: AmcwImager, reading: NoisyLight, error_m: float
+) -> DecodedFrame:
     """Run the whole engine on a ``reading`` of the list's exposure, and return the wanted pixels
     (p,)."""
     strips = listed.strips

@@ -288,16 +288,15 @@ STEEPEST = 5
 STEPS = 6
 HALF_PATH = 7
 RESIDUAL = 8
-ERROR = 9
 # those of `DepthEngine.geometry`
-ALONG = 10
-EMITTER = 11
-COSINE = 12
+ALONG = 9
+EMITTER = 10
+COSINE = 11
 # results
-LIMIT = 13
-RANGE = 14
-CODE = 15
-ROWS = 16
+LIMIT = 12
+RANGE = 13
+CODE = 14
+ROWS = 15
 
 
 def ranges_of(
@@ -305,7 +304,7 @@ def ranges_of(
     edge: np.ndarray,
     saturated: np.ndarray,
     engine: DepthEngine,
-    errors_m: np.ndarray,
+    error_m: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Convert filtered phasors to ranges.
 
@@ -314,13 +313,13 @@ def ranges_of(
         edge: (f, n) float32, edge sums.
         saturated: (n,) uint8.
         engine: the engine of these pixels.
-        errors_m: (n,) added to half the path.
+        error_m: added to half the path.
 
     Returns:
         z in metres (of invalid pixels too), the code of the first gate that each pixel fails, and
         the sum of amplitudes, (n,) each.
     """
-    n = len(errors_m)
+    n = saturated.size
     z_m = np.empty(n, f4)
     reason = np.empty(n, np.uint8)
     total = np.empty(n, f4)
@@ -332,7 +331,7 @@ def ranges_of(
         engine.outside_mask,
         engine.lattice,
         engine.gates,
-        errors_m.astype(f4),
+        f4(error_m),
         z_m,
         reason,
         total,
@@ -349,7 +348,7 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
     outside_mask,
     lattice,
     gates,
-    errors_m,
+    error_m,
     z_m,
     reason,
     total,
@@ -371,7 +370,6 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
             block[GAP, :length] = edge[f, these]
             _fold(flat, f == 0)
         half_path(turn, length, lattice, block[HALF_PATH, :length], block[RESIDUAL, :length])
-        block[ERROR, :length] = errors_m[these]
         block[ALONG : COSINE + 1, :length] = geometry[:, these]
         block[LIMIT] = least_limit
         if gates.residual_slope != ZERO:
@@ -379,7 +377,7 @@ def _range_and_gates(  # type: ignore[no-untyped-def]
                 # no limit is lower than the least
                 if block[RESIDUAL, i] > least_limit * least_limit:
                     block[LIMIT, i] = residual_limit(gates, block[GREATEST, i])
-        _judge(flat, gates, f4(n_frequencies))
+        _judge(flat, gates, f4(n_frequencies), error_m)
         total[these] = block[TOTAL, :length]
         z_m[these] = block[RANGE, :length]
         _reasons(block[CODE, :length], saturated[these], outside_mask[these], reason[these])
@@ -403,12 +401,12 @@ def _fold(block, first):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**FAST)
-def _judge(block, gates, n_frequencies):  # type: ignore[no-untyped-def]
+def _judge(block, gates, n_frequencies, error_m):  # type: ignore[no-untyped-def]
     """Fill the rows of z and of the code of the first gate that fails."""
     for i in range(np.uint64(BLOCK)):
         mean = block[STEPS * BLOCK + i] / n_frequencies
         edge = mean if gates.edge_mean > ZERO else block[STEEPEST * BLOCK + i]
-        path = block[HALF_PATH * BLOCK + i] + block[ERROR * BLOCK + i]
+        path = block[HALF_PATH * BLOCK + i] + error_m
         ratio = FOUR * path - TWO * block[ALONG * BLOCK + i]
         range_m = (FOUR * path * path - block[EMITTER * BLOCK + i]) / ratio
         z = range_m * block[COSINE * BLOCK + i]
@@ -447,48 +445,42 @@ def find_flying(  # type: ignore[no-untyped-def]
     z_m,
     total,
     reason,
-    pixels,
     neighbours,
     gate,
-    flying,
 ):
-    """Find pixels between a nearer and a farther surface in the finished image. Neighbours whose
-    phases fit a distance count, even out of range.
+    """Find pixels (n,) bool between a nearer and a farther surface in the finished image.
+    Neighbours whose phases fit a distance count, even out of range.
 
     Args:
-        z_m, total, reason: (m, t) of m pixels in t frames, from `ranges_of`.
-        pixels: (p,) indices of those to check.
-        neighbours: (p, 9) indices of their neighbours and themselves, -1 for none.
+        z_m, total, reason: (n,) from `ranges_of`.
+        neighbours: (n, 9) indices of each pixel's neighbours and itself, -1 for none.
         gate: the `FlyingGate`.
-        flying: (p, t) bool; written.
     """
+    flying = np.zeros(reason.size, np.bool_)
     window = np.empty(9, np.float32)
-    for p in range(pixels.size):
-        i = pixels[p]
-        for t in range(z_m.shape[1]):
-            flying[p, t] = False
-            if reason[i, t] != VALID:
+    for i in range(reason.size):
+        if reason[i] != VALID:
+            continue
+        nearest = z_m[i]
+        farthest = z_m[i]
+        size = 0
+        for j in neighbours[i]:
+            if j < 0:
                 continue
-            z = z_m[i, t]
-            nearest = z
-            farthest = z
-            size = 0
-            for j in neighbours[p]:
-                if j < 0:
-                    continue
-                window[size] = total[j, t]
-                size += 1
-                if reason[j, t] in (VALID, OUT_OF_RANGE, LOW_REFLECTIVITY):
-                    nearest = min(nearest, z_m[j, t])
-                    farthest = max(farthest, z_m[j, t])
-            before = z - nearest
-            behind = farthest - z
-            between = before > gate.near_m and behind > gate.far_m
-            if between and max(before, behind) > gate.most_m:
-                # amplitudes scatter by at least the gate's share of their mean
-                sample = window[:size]
-                mean = max(sample.mean(), gate.least_mean)
-                flying[p, t] = sample.std() >= gate.relative_deviation * mean
+            window[size] = total[j]
+            size += 1
+            if reason[j] in (VALID, OUT_OF_RANGE, LOW_REFLECTIVITY):
+                nearest = min(nearest, z_m[j])
+                farthest = max(farthest, z_m[j])
+        before = z_m[i] - nearest
+        behind = farthest - z_m[i]
+        between = before > gate.near_m and behind > gate.far_m
+        if between and max(before, behind) > gate.most_m:
+            # amplitudes scatter by at least the gate's share of their mean
+            sample = window[:size]
+            mean = max(sample.mean(), gate.least_mean)
+            flying[i] = sample.std() >= gate.relative_deviation * mean
+    return flying
 
 
 @numba.njit(**FAST)

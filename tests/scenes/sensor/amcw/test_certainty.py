@@ -7,11 +7,11 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Reason, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.closed_form import plane_view
 from scenes.sensor.amcw import kernels, ranging
-from scenes.sensor.amcw.certainty import _may_fly
+from scenes.sensor.amcw.certainty import _first_failed, _may_fly, _Spans
 from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.light import Light
 from scenes.sensor.amcw.linear import Filtered, linearised, unknown_filtered
@@ -210,6 +210,54 @@ def test_z_changes_with_the_path_as_a_displaced_frame_does():
     assert model is not None
     expected = model.linear.by_path.reshape(model.shape)[unit.cut]
     assert by_path == pytest.approx(expected, abs=2e-3)
+
+
+OPEN = ranging.Gates(
+    edge=f4(np.inf),
+    edge_mean=f4(0),
+    residual=f4(np.inf),
+    residual_most=f4(np.inf),
+    residual_scale=f4(0),
+    residual_slope=f4(0),
+    ratio=f4(np.inf),
+    least=f4(0),
+    total=f4(0),
+    reflectivity=f4(0),
+    nearest_m=f4(0),
+    farthest_m=f4(np.inf),
+    axial=f4(0),
+)
+
+
+@pytest.mark.parametrize(
+    ("gate", "worst", "is_least"),
+    [
+        ("edge", 0.5, False),
+        ("residual", 0.15, False),
+        ("ratio", (110 - 80) / 110, False),
+        ("least", 80.0, True),
+        ("total", 176.0, True),
+        ("reflectivity", 176.0 * 0.9**2, True),
+        ("nearest_m", 0.85, True),
+        ("farthest_m", 1.05, False),
+    ],
+)
+def test_each_gate_sees_the_worst_that_noise_makes_of_a_pixel(gate, worst, is_least):
+    spans = _Spans(
+        amplitude=np.array([[100.0], [90.0]], f4),
+        amplitude_reach=np.full((2, 1), 10.0, f4),
+        total_reach=np.array([14.0], f4),
+        edge=np.array([0.5], f4),
+        residual=np.array([0.1], f4),
+        residual_reach=np.array([0.05], f4),
+        range_m=np.array([1.0], f4),
+        limited_m=np.array([0.95], f4),
+        range_reach_m=np.array([0.1], f4),
+    )
+    for factor in (0.999, 1.001):
+        gates = OPEN._replace(**{gate: f4(factor * worst)})
+        passes = _first_failed(gates, spans)[0] == Reason.VALID
+        assert passes == ((factor < 1) == is_least)
 
 
 GATE = ranging.FlyingGate(

@@ -134,7 +134,7 @@ def decoded(engine: ranging.DepthEngine, half_m: float, error_m: float = 0.0, sa
         np.zeros((1, 1), f4),
         np.array([saturated], np.uint8),
         engine,
-        np.array([error_m]),
+        error_m,
     )
     return float(z_m[0]), int(code[0]), float(total[0])
 
@@ -188,7 +188,7 @@ def test_the_edge_sum_is_that_of_any_frequency_or_of_their_mean(edge_mean, code)
         edge,
         np.zeros(1, np.uint8),
         engine,
-        np.zeros(1),
+        0.0,
     )
     assert codes[0] == code
     assert z_m[0] == pytest.approx(1.0, abs=2e-6)
@@ -226,91 +226,42 @@ GATE = ranging.FlyingGate(
     ],
 )
 def test_a_flying_pixel_by_hand(nearer_m, farther_m, spread, flies):
-    z_m = np.full((9, 1), 1.0, f4)
+    z_m = np.full(9, 1.0, f4)
     z_m[0] = 1.0 - nearer_m
     z_m[8] = 1.0 + farther_m
-    total = np.full((9, 1), 100.0, f4)
+    total = np.full(9, 100.0, f4)
     total[:4] = 100.0 + spread
     total[5:] = 100.0 - spread
-    flying = np.zeros((1, 1), bool)
-    neighbours = np.arange(9, dtype=np.int32)[None]
-    middle = np.array([4])
-    reason = np.full((9, 1), ranging.VALID, np.uint8)
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        middle,
-        neighbours,
-        GATE,
-        flying,
-    )
-    assert bool(flying[0, 0]) == flies
+    neighbours = np.full((9, 9), -1, np.int32)
+    neighbours[4] = np.arange(9)
+    reason = np.full(9, ranging.VALID, np.uint8)
+
+    def middle_flies() -> bool:
+        flying = ranging.find_flying(z_m, total, reason, neighbours, GATE)
+        assert not np.delete(flying, 4).any()
+        return bool(flying[4])
+
+    assert middle_flies() == flies
     # the amplitudes of invalid neighbours count, their distances do not
     reason[0] = ranging.UNWRAP
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        middle,
-        neighbours,
-        GATE,
-        flying,
-    )
-    assert not flying[0, 0]
+    assert not middle_flies()
     reason[0] = ranging.OUT_OF_RANGE
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        middle,
-        neighbours,
-        GATE,
-        flying,
-    )
-    assert bool(flying[0, 0]) == flies
+    assert middle_flies() == flies
     reason[4] = ranging.EDGE
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        middle,
-        neighbours,
-        GATE,
-        flying,
-    )
-    assert not flying[0, 0]
+    assert not middle_flies()
 
 
 def test_amplitudes_of_dim_windows_are_compared_with_the_least_mean():
     """Deviations of 0.9 of a mean of 1, where a tenth of 10 is asked for."""
-    z_m = np.array([[0.9], [1.0], [1.2]], f4)
-    total = np.array([[2.1], [1.0], [0.1]], f4)
-    neighbours = np.full((1, 9), -1, np.int32)
-    neighbours[0, :3] = [0, 1, 2]
-    reason = np.full((3, 1), ranging.VALID, np.uint8)
-    flying = np.zeros((1, 1), bool)
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        np.array([1]),
-        neighbours,
-        GATE,
-        flying,
-    )
-    assert not flying[0, 0]
+    z_m = np.array([0.9, 1.0, 1.2], f4)
+    total = np.array([2.1, 1.0, 0.1], f4)
+    neighbours = np.full((3, 9), -1, np.int32)
+    neighbours[1, :3] = [0, 1, 2]
+    reason = np.full(3, ranging.VALID, np.uint8)
+    assert not ranging.find_flying(z_m, total, reason, neighbours, GATE).any()
     bold = GATE._replace(least_mean=f4(1.0))
-    ranging.find_flying(
-        z_m,
-        total,
-        reason,
-        np.array([1]),
-        neighbours,
-        bold,
-        flying,
-    )
-    assert flying[0, 0]
+    flying = ranging.find_flying(z_m, total, reason, neighbours, bold)
+    assert flying.tolist() == [False, True, False]
 
 
 def test_rounding_of_valid_pixels():
