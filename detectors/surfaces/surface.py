@@ -284,9 +284,9 @@ def _lar(
     surfaces, so that only those between them need many steps. Where the sample misleads, by an
     interior point method, which takes five times as long as smoothing takes elsewhere."""
     few_basis, few_z = _thinned(basis, z, max(SAMPLE_POINTS, len(z) // LAR_THINNING))
-    solution = None
+    c = start
     if len(few_z) == len(z):
-        solution = _smoothed(basis, z, start, knees, np.inf)
+        solution = _smoothed(basis, z, c, knees, np.inf)
     else:
         c = _lar(few_basis, few_z, start, KNEES[:3])[0]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
@@ -294,7 +294,7 @@ def _lar(
         solution = _smoothed(basis, z, c, knees[2:], margin)
     if solution is not None:
         return solution
-    c, gap = least_absolute(basis, z, start, GAP_CONVERGED)
+    c, gap = least_absolute(basis, z, c, GAP_CONVERGED)
     return c, _lar_note(gap)
 
 

@@ -88,3 +88,12 @@ def works(seconds: float) -> None:
     until_s = time.process_time() + seconds
     while time.process_time() < until_s:
         pass
+
+
+def inherited() -> tuple[str, bool]:
+    """Return whether this process is a fork of its driver (which marks a module) or has imported
+    its modules, and whether SIGTERM ends it."""
+    from harness.runs import processes
+
+    is_ended = signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    return getattr(processes, "MARK", "imported"), is_ended

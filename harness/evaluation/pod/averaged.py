@@ -136,13 +136,12 @@ class ModelAverage:
         """Return lower and upper POD at ``sizes`` (n,), each one-sided as in `bound`: a curve's
         POD at a size is below 90 % where its a90 is larger, so that the lower edge crosses 90 % at
         a90/95."""
-        low = np.empty(len(sizes))
-        high = np.empty(len(sizes))
+        edges = np.empty((2, len(sizes)))
+        shares = [self.tail, 1.0 - self.tail]
         for number, size in enumerate(np.maximum(sizes, np.finfo(float).tiny)):
             pods = self.curves.pods(float(size))
-            low[number] = weighted_quantile(pods, self.curves.weight, self.tail)
-            high[number] = weighted_quantile(pods, self.curves.weight, 1.0 - self.tail)
-        return low, high
+            edges[:, number] = weighted_quantiles(pods, self.curves.weight, shares)
+        return edges[0], edges[1]
 
     def _constant(self) -> str:
         """Return why a constant probability is not rejected; empty if it is."""
@@ -163,9 +162,18 @@ def tail_of(targets: int) -> float:
 
 def weighted_quantile(values: np.ndarray, weight: np.ndarray, share: float) -> float:
     """Return the value below which this share of the weight (n,) lies, whose sum is 1."""
+    return float(weighted_quantiles(values, weight, [share])[0])
+
+
+def weighted_quantiles(
+    values: np.ndarray,
+    weight: np.ndarray,
+    shares: Sequence[float],
+) -> np.ndarray:
+    """Return the values (s,) below which these shares of the weight (n,) lie, whose sum is 1."""
     order = np.argsort(values, kind="stable")
     below = np.cumsum(weight[order]) - weight[order] / 2
-    return float(np.interp(share, below, values[order]))
+    return np.asarray(np.interp(shares, below, values[order]))
 
 
 def log_weights(width: np.ndarray, targets: int) -> np.ndarray:

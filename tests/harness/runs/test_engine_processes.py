@@ -139,6 +139,40 @@ def test_processes_run_the_drivers_code_whatever_lies_in_the_folder_they_start_i
     assert str(ROOT / "harness" / "trials" / "trial.py") in done.stdout, done.stdout + done.stderr
 
 
+DRIVER = """
+import signal, sys, threading
+
+from harness.runs import processes
+from harness.runs.jobs import Job, Limits
+from tests.support import faulty_jobs
+
+processes.MARK = "forked"
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+if sys.argv[1] == "another thread":
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+if sys.argv[1] == "open3d":
+    sys.modules["open3d"] = None
+with processes.LocalEngine(1, Limits()) as engine:
+    engine.submit(Job("inherited", "trials", faulty_jobs.inherited, ()))
+    print(engine.ended()[0][1].value)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no driver is forked")
+@pytest.mark.parametrize(
+    ("state", "mark"),
+    [("one thread", "forked"), ("another thread", "imported"), ("open3d", "imported")],
+)
+def test_processes_are_forks_of_a_driver_that_is_safe_to_fork(state: str, mark: str):
+    """SIGTERM is the driver's to answer: its handler does not stay in the forks."""
+    environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    command = [sys.executable, "-c", DRIVER, state]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.stdout.strip() == str((mark, True)), done.stdout + done.stderr
+
+
 def test_serial_runs_here_and_in_order():
     jobs = [Job("pid", "trials", os.getpid, ()), *doubles(3), job(faulty_jobs.raises)]
     result = run(SerialEngine(), jobs)
