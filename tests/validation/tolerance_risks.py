@@ -18,7 +18,7 @@ from detectors import load_detector
 from detectors.surfaces.scans import PartScan, laid_under, scan_of
 from harness.evaluation import intervals
 from harness.inspection.judging import judged
-from harness.inspection.tolerance import CONFORMS, FAILS, Tolerance, part_decision
+from harness.inspection.tolerance import CONFORMS, FAILS, Missed, Tolerance, part_decision
 from harness.vocabulary.geometry import Cloud
 from tests.support.made_parts import Dent, MadePart, cloud_of, pose
 
@@ -59,7 +59,7 @@ def decided_on(number: int, reference: PartScan | None) -> Decided:
     settings = {"crop": {"kind": "none"}, "surface": {"shape": shape}}
     detector = load_detector("local", settings)
     result = judged(detector, cloud, detector.analyse(cloud), THRESHOLD)
-    decision = part_decision(result, (TOLERANCE,), None, "")
+    decision = part_decision(result, (TOLERANCE,), Missed(""))
     decisions = [finding.decision for finding in decision.findings if finding.id == 1]
     return Decided(true_mm, decisions[0] if decisions else CONFORMS)
 
