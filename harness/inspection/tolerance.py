@@ -116,7 +116,7 @@ def decided(value_mm: float, uncertainty_mm: float, limit_mm: float) -> str:
 
 @dataclass(frozen=True)
 class Missed:
-    """What an inspection would have missed at its tolerances."""
+    """The damage that an inspection would have missed at its tolerances."""
 
     text: str
     """In words, or why it is not known."""
