@@ -48,6 +48,9 @@ BENT = 0.5
 """Bend, in pixels, that makes an edge."""
 REFINEMENTS = 8
 """Number of steps along rays."""
+NOISE_MARGIN = 2.0
+"""Multiple of the information that noise feigns which is taken off: rounding and filters make it
+differ from that of independent pixels."""
 BEND_NOISE = 24.0
 """A second difference of noise has 6 of its variances, and its square is below 4 times that in 95 %
 of places."""
@@ -328,8 +331,8 @@ def refined(
     nearly as possible: steps and walls, which closest points blur, then fix the part along itself.
 
     Slopes are differences over two pixels, whose noise is independent of that of the pixel between
-    them. What this noise adds to the information is taken off again. ``known`` and ``share_px`` as
-    of `fitted`."""
+    them. What this noise adds to the information is taken off again, `NOISE_MARGIN` times.
+    ``known`` and ``share_px`` as of `fitted`."""
     rays = points[:, :2] / points[:, 2:] if central else points[:, :2]
     T = pose.T_part_camera
     pitch_m = spacing(points)
@@ -367,7 +370,7 @@ def refined(
         gradient = weighted @ off - information @ start.offset_of(T, middle)
         T = moved_by(np.linalg.inv(weighted @ slopes + information) @ gradient, middle) @ T
     covariance = _covariance(
-        weighted @ slopes - by_noise, information, arm_m=arm_m, loosest_m=pitch_m
+        weighted @ slopes - NOISE_MARGIN * by_noise, information, arm_m=arm_m, loosest_m=pitch_m
     )
     variances = np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
     return replace(
