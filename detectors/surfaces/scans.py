@@ -96,13 +96,13 @@ def noise_m2_of(cloud: Cloud, mask: np.ndarray) -> np.ndarray:
 def scan_of(cloud: Cloud, mask: np.ndarray, name: str) -> PartScan:
     """Return the part that a cloud shows where ``mask`` (h, w) is true. Raises UserError if the
     points span no surface."""
-    central = cloud.projection == "central"
+    noise_m2 = noise_m2_of(cloud, mask)
     return _scan(
         name,
         cloud.points_m[mask],
-        central=central,
-        variances_m2=noise_m2_of(cloud, mask),
-        noise_m2=noise_m2_of(cloud, mask),
+        central=cloud.projection == "central",
+        variances_m2=noise_m2,
+        noise_m2=noise_m2,
         share_px=max(cloud.noise_reach_px, 1.0) ** 2,
         parts=1,
     )

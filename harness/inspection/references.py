@@ -31,8 +31,9 @@ MOST_PARTS = 50
 """Most captures of good parts."""
 MOST_LEFT_OUT = 10
 """Most parts that are left out in turn, of which each costs an analysis by each detector."""
-WHOLE_FILES = (".mkv", ".mcap", ".db3", ".bag", ".npz", ".mat", ".ply", ".pcd", ".r3d")
-"""Files that each are a capture when they lie together in a folder of good parts."""
+WHOLE_FILES = (".mkv", ".bag", ".r3d")
+"""Files that each are a capture when they lie together in a folder; others there are the frames of
+one capture."""
 LEAST_SCORE = 3.0
 """Findings of left-out parts with lower scores are not counted: no threshold is so low."""
 
@@ -53,8 +54,7 @@ def captures_in(path: Path) -> tuple[Path, ...]:
         # the folders of one capture: depth/ beside color/
         return () if (path / "depth").is_dir() else tuple(entries)
     whole = all(entry.suffix.lower() in WHOLE_FILES for entry in entries)
-    is_bag = any(entry.suffix.lower() in (".mcap", ".db3") for entry in entries)
-    return tuple(entries) if whole and len(entries) > 1 and not is_bag else ()
+    return tuple(entries) if whole else ()
 
 
 @dataclass(frozen=True, eq=False)

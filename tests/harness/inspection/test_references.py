@@ -108,6 +108,12 @@ def test_the_kind_of_a_reference_is_seen(captures: Path, tmp_path: Path) -> None
     assert [path.name for path in captures_in(captures / "good")] == [
         f"part{number}" for number in range(4)
     ]
+    for name, count in (("a.mkv", 2), ("b.ply", 0)):
+        folder = tmp_path / name
+        folder.mkdir()
+        for number in (1, 2):
+            (folder / f"{number}{name[1:]}").touch()
+        assert len(captures_in(folder)) == count
     box = trimesh.creation.box((1, 1, 1))
     box.export(tmp_path / "part.ply")
     trimesh.PointCloud(box.vertices).export(tmp_path / "scan.ply")
