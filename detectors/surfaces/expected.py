@@ -57,6 +57,10 @@ of places."""
 BETWEEN = 0.25
 """Most that a straight line between two samples is off a kink between them, as a share of the
 second difference."""
+LARGER = 2.0
+"""Ratio of the target's size to the reference's from which that cannot show the part."""
+SMALLER = 10.0
+"""Ratio of the reference's size to the target's from which its outline cannot place the target."""
 LEAST_OVERLAP = 0.5
 """Least share of the part's points that the reference must show."""
 WORSE = 1.5
@@ -160,6 +164,12 @@ def spacing(points: np.ndarray) -> float:
     """Return the side of a square with one of the points (n, 3), in x and y."""
     extent = np.ptp(points[:, :2], axis=0)
     return float(np.sqrt(np.prod(extent) / len(points)))
+
+
+def diagonal(points: np.ndarray) -> float:
+    """Return the diagonal of the box around points (n, 3), without the outermost hundredth."""
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def sampled(points: np.ndarray) -> np.ndarray:
