@@ -237,6 +237,12 @@ def _reference(
         return None
 
     def opened(path: Path) -> tuple[Recording, Cloud]:
+        cloud_of_result = path / outputs.CLOUD.name
+        if cloud_of_result.is_file() and (path / outputs.FINDINGS_DATA.name).is_file():
+            # the cloud of an earlier inspection is in metres, and its pattern is subtracted
+            stored = argparse.Namespace(**{**vars(arguments), "unit": "m"})
+            recording = _opened(stored, [cloud_of_result])
+            return recording, _averaged(stored, recording, None)
         recording = _opened(arguments, [path])
         return recording, _averaged(arguments, recording, flat_field)
 

@@ -83,6 +83,15 @@ def test_features_of_good_parts_are_no_findings(
     assert "on 4 good parts, each left out once" in capsys.readouterr().out
 
 
+def test_an_earlier_inspection_is_a_reference(captures: Path) -> None:
+    then = [str(captures / "then"), *OPTIONS, "--crop", "box:-70,70,-50,50,300,450"]
+    assert detect.main([*then, "--out", str(captures / "result")]) == 0
+    data = inspected(captures, "result", "since_result")
+    # a cloud without a grid shows no frames, but the same change
+    assert data["change"]["damage"][0]["state"] == GROWN
+    assert data["change"]["damage"][0]["distance_mm"] == pytest.approx(1.5, abs=0.15)
+
+
 def test_marks_place_a_flat_board(tmp_path: Path) -> None:
     for name, turn_deg, seed in (("then", 0.0, 1), ("now", 12.0, 2)):
         pose_of_board = marked_board.T_camera_board(turn_deg)
