@@ -193,7 +193,8 @@ class PartDecision:
             numbers = {finding.id for finding in self.findings if finding.decision == decision}
             if numbers and decision != CONFORMS:
                 listed = joined_words([str(number) for number in sorted(numbers)])
-                counts.append(f"{decision}: finding{'s' * (len(numbers) > 1)} {listed}")
+                prefix = "" if decision == self.decision else f"{decision}: "
+                counts.append(f"{prefix}finding{'s' * (len(numbers) > 1)} {listed}")
         if self.decision == UNDECIDED:
             start = "Undecided whether the part conforms"
         else:

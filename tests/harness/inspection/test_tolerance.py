@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,14 @@ def test_the_part_is_as_its_worst_finding_and_what_was_missed(
     assert part.decision == decision
     assert part.facts["decision"] == decision
     assert part.sentence.endswith("so much is missed.")
+
+
+def test_the_sentence_names_the_findings() -> None:
+    found = (on(1, FAILS), on(2, UNDECIDED), on(3, FAILS), on(4, CONFORMS))
+    part = PartDecision((DEPTH, Tolerance("width", 4.0)), found, FOUND, "")
+    start = "The part does not conform to a depth of at most 0.5 mm and width of at most 4 mm"
+    assert part.short == f"{start} (findings 1 and 3; undecided: finding 2)"
+    assert "a growth in depth" in replace(part, since="the earlier capture").short
 
 
 def test_doubts_about_a_decision() -> None:
