@@ -48,12 +48,19 @@ BENT = 0.5
 """Bend, in pixels, that makes an edge."""
 REFINEMENTS = 8
 """Number of steps along rays."""
+NOISE_MARGIN = 2.0
+"""Multiple of the information that noise feigns which is taken off: rounding and filters make it
+differ from that of independent pixels."""
 BEND_NOISE = 24.0
 """A second difference of noise has 6 of its variances, and its square is below 4 times that in 95 %
 of places."""
 BETWEEN = 0.25
 """Most that a straight line between two samples is off a kink between them, as a share of the
 second difference."""
+LARGER = 2.0
+"""Ratio of the target's size to the reference's from which that cannot show the part."""
+SMALLER = 10.0
+"""Ratio of the reference's size to the target's from which its outline cannot place the target."""
 LEAST_OVERLAP = 0.5
 """Least share of the part's points that the reference must show."""
 WORSE = 1.5
@@ -157,6 +164,12 @@ def spacing(points: np.ndarray) -> float:
     """Return the side of a square with one of the points (n, 3), in x and y."""
     extent = np.ptp(points[:, :2], axis=0)
     return float(np.sqrt(np.prod(extent) / len(points)))
+
+
+def diagonal(points: np.ndarray) -> float:
+    """Return the diagonal of the box around points (n, 3), without the outermost hundredth."""
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def sampled(points: np.ndarray) -> np.ndarray:
@@ -328,8 +341,8 @@ def refined(
     nearly as possible: steps and walls, which closest points blur, then fix the part along itself.
 
     Slopes are differences over two pixels, whose noise is independent of that of the pixel between
-    them. What this noise adds to the information is taken off again. ``known`` and ``share_px`` as
-    of `fitted`."""
+    them. What this noise adds to the information is taken off again, `NOISE_MARGIN` times.
+    ``known`` and ``share_px`` as of `fitted`."""
     rays = points[:, :2] / points[:, 2:] if central else points[:, :2]
     T = pose.T_part_camera
     pitch_m = spacing(points)
@@ -367,7 +380,7 @@ def refined(
         gradient = weighted @ off - information @ start.offset_of(T, middle)
         T = moved_by(np.linalg.inv(weighted @ slopes + information) @ gradient, middle) @ T
     covariance = _covariance(
-        weighted @ slopes - by_noise, information, arm_m=arm_m, loosest_m=pitch_m
+        weighted @ slopes - NOISE_MARGIN * by_noise, information, arm_m=arm_m, loosest_m=pitch_m
     )
     variances = np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
     return replace(

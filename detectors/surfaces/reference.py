@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from detectors.surfaces.expected import (
+    LARGER,
     LEAST_OVERLAP,
     LOOSE,
+    SMALLER,
     Pose,
     Triangles,
     another_part,
     closest_of,
+    diagonal,
     expected,
     fitted,
     met,
@@ -28,11 +31,6 @@ from detectors.surfaces.surface import ReferenceConfig
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, ExpectedSurface
 from harness.vocabulary.meshes import UNITS_M, front_first, read_mesh
-
-LARGER = 2.0
-"""Ratio of the target's size to the mesh's from which the mesh cannot be the part."""
-SMALLER = 10.0
-"""Ratio of the mesh's size to the target's from which its outline cannot place the target."""
 
 
 @lru_cache(maxsize=4)
@@ -85,8 +83,8 @@ def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:
 def _refuse_unit(reference: ReferenceConfig, front: Triangles, points: np.ndarray) -> None:
     """Raise UserError if points (n, 3) extend beyond the part or are a tiny piece of it, as in a
     wrong unit of length."""
-    extent_m = _diagonal(points)
-    part_m = _diagonal(front.corners_m.reshape(-1, 3))
+    extent_m = diagonal(points)
+    part_m = diagonal(front.corners_m.reshape(-1, 3))
     if part_m / SMALLER < extent_m < LARGER * part_m:
         return
     fitting = []
@@ -105,12 +103,6 @@ def _refuse_unit(reference: ReferenceConfig, front: Triangles, points: np.ndarra
         legal=f"a target of {1 / SMALLER:g} to {LARGER:g} times the part's size",
         fix=fix,
     )
-
-
-def _diagonal(points: np.ndarray) -> float:
-    """Return the diagonal of the box around points (n, 3), without the outermost hundredth."""
-    low, high = np.quantile(points, (0.01, 0.99), axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def _refuse_other(

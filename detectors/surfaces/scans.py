@@ -21,11 +21,14 @@ from scipy.spatial import Delaunay, cKDTree
 from detectors.pixels.medians import group_medians
 from detectors.pixels.noise import average_variance_m2, rounding_floor, sigma_of
 from detectors.surfaces.expected import (
+    LARGER,
     LEAST_OVERLAP,
+    SMALLER,
     KnownPose,
     Pose,
     Triangles,
     another_part,
+    diagonal,
     expected,
     fitted,
     met,
@@ -96,13 +99,13 @@ def noise_m2_of(cloud: Cloud, mask: np.ndarray) -> np.ndarray:
 def scan_of(cloud: Cloud, mask: np.ndarray, name: str) -> PartScan:
     """Return the part that a cloud shows where ``mask`` (h, w) is true. Raises UserError if the
     points span no surface."""
-    central = cloud.projection == "central"
+    noise_m2 = noise_m2_of(cloud, mask)
     return _scan(
         name,
         cloud.points_m[mask],
-        central=central,
-        variances_m2=noise_m2_of(cloud, mask),
-        noise_m2=noise_m2_of(cloud, mask),
+        central=cloud.projection == "central",
+        variances_m2=noise_m2,
+        noise_m2=noise_m2,
         share_px=max(cloud.noise_reach_px, 1.0) ** 2,
         parts=1,
     )
@@ -259,6 +262,15 @@ def laid_under(
     the pose by marks. Raises UserError if the scan does not show this part."""
     central = cloud.projection == "central"
     points_m = cloud.points_m[mask]
+    part_m = diagonal(points_m)
+    reference_m = diagonal(scan.points_m)
+    if not reference_m / SMALLER < part_m < LARGER * reference_m:
+        raise UserError(
+            f"{scan.name}: is {reference_m / MM:.3g} mm large, and this part {part_m / MM:.3g} mm",
+            legal=f"a part of {1 / SMALLER:g} to {LARGER:g} times the reference's size",
+            fix="state a unit that holds for both (--unit), or choose the same surface in both"
+            " (--target, --crop)",
+        )
     share_px = max(cloud.noise_reach_px, 1.0) ** 2
     pose = placed(scan, points_m, share_px, central, known)
     z_m, variances_m2 = met(scan.triangles, pose.T_part_camera, _plan(points_m, central), central)

@@ -39,6 +39,8 @@ MOST_PLACES = 40
 """Most discs in a cloud."""
 MOST_SHARE = 0.03
 """Largest share of the judged pixels that discs cover, so that they do not bend the fit."""
+MOST_ROUNDS = 15
+"""Most clouds with discs of one size."""
 APART_PX = 24.0
 """Least distance between the rims of two discs: the widest filters reach 25 pixels."""
 RARE = 0.25
@@ -90,11 +92,7 @@ def limit_of(
     """Return the sizes of discs that the detector finds in a judged cloud at the threshold.
     ``depth_m``: their depth, or None for half their width. Raises UserError without a pixel grid,
     or without room for a disc."""
-    if not result.cloud.organised:
-        raise UserError(
-            "--limit presses damage into a grid of pixels, and these points have none",
-            fix="leave out --limit, or give depth images",
-        )
+    _refuse_ungridded(result)
     free = free_area(result)
     counts: dict[float, SizeCount] = {}
     step = 0.0
@@ -114,6 +112,41 @@ def limit_of(
         )
     sizes = tuple(counts[number] for number in sorted(counts))
     return fitted(sizes, depth_m)
+
+
+def found_at(
+    detector: Detector,
+    result: Judged,
+    threshold: float,
+    *,
+    diameter_m: float,
+    depth_m: float,
+) -> SizeCount | None:
+    """Return how many of some `MOST_PLACES` discs of one size the detector finds in a judged cloud
+    at the threshold, in up to `MOST_ROUNDS` clouds, as few lie in each; None without room for any.
+    Raises UserError without a pixel grid."""
+    _refuse_ungridded(result)
+    disc = Disc(diameter_m, depth_m)
+    free = free_area(result)
+    hits = 0
+    places = 0
+    for number in range(MOST_ROUNDS):
+        count = _counted(detector, result, threshold, free, disc, round_number=number)
+        if count is None:
+            break
+        hits += count.hits
+        places += count.places
+        if places >= MOST_PLACES:
+            break
+    return _size_count(disc, hits, places) if places else None
+
+
+def _refuse_ungridded(result: Judged) -> None:
+    if not result.cloud.organised:
+        raise UserError(
+            "--limit presses damage into a grid of pixels, and these points have none",
+            fix="leave out --limit, or give depth images",
+        )
 
 
 @dataclass(frozen=True)
@@ -159,10 +192,17 @@ def _share(count: SizeCount) -> float:
 
 
 def _counted(
-    detector: Detector, result: Judged, threshold: float, free: np.ndarray, disc: Disc
+    detector: Detector,
+    result: Judged,
+    threshold: float,
+    free: np.ndarray,
+    disc: Disc,
+    *,
+    round_number: int = 0,
 ) -> SizeCount | None:
-    """Press discs of one size into the cloud and count those that are found; None without room."""
-    centres = places_for(result, free, disc)
+    """Press discs of one size into the cloud and count those that are found; None without room.
+    ``round_number``: another has other places."""
+    centres = places_for(result, free, disc, round_number)
     if not len(centres):
         return None
     pressed, floors = pressed_in(result, centres, disc)
@@ -173,12 +213,17 @@ def _counted(
     for detection in detector.find(pressed, evidence, threshold):
         is_found[detection.pixels] = True
     hits = sum(bool(is_found[floor].any()) for floor in floors)
-    low, high = intervals.wilson(hits, len(centres))
+    return _size_count(disc, hits, len(centres))
+
+
+def _size_count(disc: Disc, hits: int, places: int) -> SizeCount:
+    """Return the hits at discs of one size with their interval."""
+    low, high = intervals.wilson(hits, places)
     return SizeCount(
         diameter_mm=disc.diameter_m / MM,
         depth_mm=disc.depth_m / MM,
         hits=hits,
-        places=len(centres),
+        places=places,
         low=float(low),
         high=float(high),
     )
@@ -231,15 +276,16 @@ def free_area(result: Judged) -> np.ndarray:
     return np.isfinite(result.evidence.score) & result.cloud.valid & ~near
 
 
-def places_for(result: Judged, free: np.ndarray, disc: Disc) -> np.ndarray:
+def places_for(result: Judged, free: np.ndarray, disc: Disc, round_number: int = 0) -> np.ndarray:
     """Return the flat indices (n,) of random centres with room for a disc and apart from one
-    another; the same at each call."""
+    another; the same at each call with this ``round_number``."""
     radius_px = 0.5 * disc.diameter_m / _pitch_m(result)
     padded = np.pad(free.astype(np.uint8), 1)
     room_px = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     margin_px = radius_px + max(1.0, 0.5 * result.cloud.noise_reach_px)
     candidates = np.flatnonzero(room_px.ravel() > margin_px)
-    shuffled = random_stream(0, "limit", f"{disc.diameter_m / MM:.6f} mm").permutation(candidates)
+    size = f"{disc.diameter_m / MM:.6f} mm"
+    shuffled = random_stream(round_number, "limit", size).permutation(candidates)
     area_px = math.pi * max(radius_px, 0.5) ** 2
     most = min(MOST_PLACES, max(1, int(MOST_SHARE * free.sum() / area_px)))
     apart_px = 2 * radius_px + APART_PX

@@ -18,6 +18,7 @@ from detectors.surfaces.scans import GoodParts, PartScan, good_parts, laid_under
 from detectors.views.marks.find import find_marks
 from detectors.views.marks.mark import MarksConfig
 from detectors.views.registration.by_marks import register_by_marks
+from detectors.views.registration.pairing import SHARED_M
 from detectors.views.view import PreparedView, View
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud
@@ -30,8 +31,9 @@ MOST_PARTS = 50
 """Most captures of good parts."""
 MOST_LEFT_OUT = 10
 """Most parts that are left out in turn, of which each costs an analysis by each detector."""
-WHOLE_FILES = (".mkv", ".mcap", ".db3", ".bag", ".npz", ".mat", ".ply", ".pcd", ".r3d")
-"""Files that each are a capture when they lie together in a folder of good parts."""
+WHOLE_FILES = (".mkv", ".bag", ".r3d")
+"""Files that each are a capture when they lie together in a folder; others there are the frames of
+one capture."""
 LEAST_SCORE = 3.0
 """Findings of left-out parts with lower scores are not counted: no threshold is so low."""
 
@@ -52,8 +54,7 @@ def captures_in(path: Path) -> tuple[Path, ...]:
         # the folders of one capture: depth/ beside color/
         return () if (path / "depth").is_dir() else tuple(entries)
     whole = all(entry.suffix.lower() in WHOLE_FILES for entry in entries)
-    is_bag = any(entry.suffix.lower() in (".mcap", ".db3") for entry in entries)
-    return tuple(entries) if whole and len(entries) > 1 and not is_bag else ()
+    return tuple(entries) if whole else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,13 +83,20 @@ def seen(name: str, cloud: Cloud, config: AnyCrop, marks: MarksConfig) -> SeenPa
 
 
 def pose_by_marks(reference: SeenPart, part: SeenPart) -> KnownPose | None:
-    """Return the pose of a part's cloud on the reference's by marks; None without enough marks."""
+    """Return the pose of a part's cloud on the reference's by marks; None without enough marks. Its
+    covariance holds `SHARED_M` of each mark, too, which each capture adds by itself."""
     if reference.cloud.rgb is None or part.cloud.rgb is None:
         return None
     registration = register_by_marks(reference.prepared, part.prepared)
     if registration.failure:
         return None
-    return KnownPose(registration.T_reference_view, registration.covariance, registration.centre_m)
+    centres_m = np.array([mark.centre_m for mark in reference.prepared.marks.trusted])
+    arms_m2 = ((centres_m - registration.centre_m) ** 2).sum(axis=1).mean()
+    shared_m2 = 2.0 * SHARED_M**2 / registration.pairs
+    shared = np.diag([shared_m2 / arms_m2] * 3 + [shared_m2] * 3)
+    return KnownPose(
+        registration.T_reference_view, registration.covariance + shared, registration.centre_m
+    )
 
 
 @dataclass(frozen=True, eq=False)

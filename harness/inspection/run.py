@@ -35,6 +35,7 @@ from harness.inspection.several_views import merged_views, mistakes_named, regis
 from harness.inspection.tolerance import (
     PartDecision,
     Tolerance,
+    missed_at,
     part_decision,
     tolerances_from,
 )
@@ -49,7 +50,6 @@ from harness.inspection.verdict import (
 from harness.records import outputs
 from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.provenance import made_by, record
@@ -237,6 +237,12 @@ def _reference(
         return None
 
     def opened(path: Path) -> tuple[Recording, Cloud]:
+        cloud_of_result = path / outputs.CLOUD.name
+        if cloud_of_result.is_file() and (path / outputs.FINDINGS_DATA.name).is_file():
+            # the cloud of an earlier inspection is in metres, and its pattern is subtracted
+            stored = argparse.Namespace(**{**vars(arguments), "unit": "m"})
+            recording = _opened(stored, [cloud_of_result])
+            return recording, _averaged(stored, recording, None)
         recording = _opened(arguments, [path])
         return recording, _averaged(arguments, recording, flat_field)
 
@@ -365,15 +371,8 @@ def _decision(
     tolerances."""
     if not tolerances:
         return None
-    depths_m = [tolerance.limit_mm * MM for tolerance in tolerances if tolerance.kind == "depth"]
-    depth_m = depths_m[0] if depths_m else None
-    missed = None
-    try:
-        missed = limit_of(candidate.detector, result, candidate.threshold, depth_m)
-        text = missed.text
-    except UserError as mistake:
-        text = f"what would have been missed is not known ({mistake.message})"
-    return part_decision(result, tolerances, missed, text, changes)
+    missed = missed_at(candidate.detector, result, candidate.threshold, tolerances)
+    return part_decision(result, tolerances, missed, changes)
 
 
 def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evidence:

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.stats import norm
 
 from detectors.findings.family import DEPTH_ERROR
-from detectors.interface import Detection, Evidence
+from detectors.interface import Detection, Detector, Evidence
 from harness.inspection.changes import GONE, SHRUNK, Changes
-from harness.inspection.limit import Limit
+from harness.inspection.limit import Limit, SizeCount, found_at, limit_of
 from harness.inspection.verdict import DOUBTFUL, FEATURE
 from harness.report.findings import Finding, Judged
 from harness.vocabulary.errors import UserError
@@ -115,29 +115,74 @@ def decided(value_mm: float, uncertainty_mm: float, limit_mm: float) -> str:
 
 
 @dataclass(frozen=True)
+class Missed:
+    """The damage that an inspection would have missed at its tolerances."""
+
+    text: str
+    """In words, or why it is not known."""
+    limit: Limit | None = None
+    """Widths at which damage as deep as the tolerance is found; None if they are not known."""
+    at_both: SizeCount | None = None
+    """Damage as deep and as wide as both tolerances; None unless both are stated."""
+
+    @property
+    def is_enough(self) -> bool:
+        """True if finding nothing says something: damage at both tolerances is missed no more often
+        than `RISK`, or the width from which damage is found is bounded."""
+        if self.at_both is not None:
+            return self.at_both.hits >= (1.0 - RISK) * self.at_both.places
+        return self.limit is not None and math.isfinite(self.limit.bound_mm)
+
+
+def missed_at(
+    detector: Detector, result: Judged, threshold: float, tolerances: Sequence[Tolerance]
+) -> Missed:
+    """Press damage at the tolerances into a judged cloud, and count what is found."""
+    sizes_m = {tolerance.kind: tolerance.limit_mm * MM for tolerance in tolerances}
+    try:
+        limit = limit_of(detector, result, threshold, sizes_m.get("depth"))
+        at_both = None
+        if len(sizes_m) == len(KINDS):
+            at_both = found_at(
+                detector,
+                result,
+                threshold,
+                diameter_m=sizes_m["width"],
+                depth_m=sizes_m["depth"],
+            )
+    except UserError as mistake:
+        return Missed(f"what would have been missed is not known ({mistake.message})")
+    if at_both is None:
+        return Missed(limit.text, limit)
+    share = at_both.hits / at_both.places
+    text = (
+        f"a dent {at_both.depth_mm:.3g} mm deep and {at_both.diameter_mm:.3g} mm wide is found with"
+        f" probability {share:.2f} ({at_both.low:.2f} at least, with 97.5 % confidence)"
+    )
+    return Missed(f"{text}; {limit.text}", limit, at_both)
+
+
+@dataclass(frozen=True)
 class PartDecision:
     """The decision on a part."""
 
     tolerances: tuple[Tolerance, ...]
     findings: tuple[FindingDecision, ...]
     """By tolerance and finding."""
-    missed: Limit | None
-    """Sizes at the tolerance that would have been missed; None if that is not known."""
-    missed_text: str
-    """The same in words, or why it is not known."""
+    missed: Missed
+    """What would have been missed."""
     since: str
     """The earlier capture since which sizes may grow by the tolerances; empty if these limit the
     sizes themselves."""
 
     @property
     def decision(self) -> str:
-        """One of `DECISIONS`: the worst of the findings. A part without findings whose missed
-        damage is unknown is not accepted."""
+        """One of `DECISIONS`: the worst of the findings. A part on which too much is missed is not
+        accepted."""
         for decision in DECISIONS[:2]:
             if any(finding.decision == decision for finding in self.findings):
                 return decision
-        is_known = self.missed is not None and math.isfinite(self.missed.bound_mm)
-        return CONFORMS if is_known else UNDECIDED
+        return CONFORMS if self.missed.is_enough else UNDECIDED
 
     @property
     def short(self) -> str:
@@ -148,7 +193,8 @@ class PartDecision:
             numbers = {finding.id for finding in self.findings if finding.decision == decision}
             if numbers and decision != CONFORMS:
                 listed = joined_words([str(number) for number in sorted(numbers)])
-                counts.append(f"{decision}: finding{'s' * (len(numbers) > 1)} {listed}")
+                prefix = "" if decision == self.decision else f"{decision}: "
+                counts.append(f"{prefix}finding{'s' * (len(numbers) > 1)} {listed}")
         if self.decision == UNDECIDED:
             start = "Undecided whether the part conforms"
         else:
@@ -160,7 +206,7 @@ class PartDecision:
     @property
     def sentence(self) -> str:
         """Return the decision and what would have been missed, in one sentence."""
-        return f"{self.short}; {self.missed_text}."
+        return f"{self.short}; {self.missed.text}."
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -178,16 +224,14 @@ class PartDecision:
             "since": self.since or None,
             "tolerances": [asdict(tolerance) for tolerance in self.tolerances],
             "findings": findings,
-            "missed": None if self.missed is None else self.missed.facts,
-            "missed_text": self.missed_text,
+            "missed": asdict(self.missed),
         }
 
 
 def part_decision(
     result: Judged,
     tolerances: Sequence[Tolerance],
-    missed: Limit | None,
-    missed_text: str,
+    missed: Missed,
     changes: Changes | None = None,
 ) -> PartDecision:
     """Decide on each finding that is no feature of the part, and on the part. ``changes``: since an
@@ -207,7 +251,6 @@ def part_decision(
         tolerances=tuple(tolerances),
         findings=tuple(decisions),
         missed=missed,
-        missed_text=missed_text,
         since=since,
     )
 

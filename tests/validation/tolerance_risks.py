@@ -1,6 +1,6 @@
 """How often a wrong decision is made on simulated parts with a dent about as deep as allowed.
 
-    python tests/validation/tolerance_risks.py [PARTS]
+    python tests/validation/tolerance_risks.py [[FIRST] LAST]
 
 Each part is a ribbed plate with one dent, 11 to 16 mm wide and 0.5 to 1.5 times as deep as the
 tolerance of 1 mm, in another pose. It is compared with one good part, or, without ribs, with a
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from detectors import load_detector
 from detectors.surfaces.scans import PartScan, laid_under, scan_of
 from harness.evaluation import intervals
 from harness.inspection.judging import judged
-from harness.inspection.tolerance import CONFORMS, FAILS, Tolerance, part_decision
-from harness.vocabulary.geometry import Cloud
+from harness.inspection.tolerance import CONFORMS, FAILS, Missed, Tolerance, part_decision
+from harness.vocabulary.geometry import Cloud, ExpectedSurface
 from tests.support.made_parts import Dent, MadePart, cloud_of, pose
 
 TOLERANCE = Tolerance("depth", 1.0)
@@ -59,34 +60,40 @@ def decided_on(number: int, reference: PartScan | None) -> Decided:
     settings = {"crop": {"kind": "none"}, "surface": {"shape": shape}}
     detector = load_detector("local", settings)
     result = judged(detector, cloud, detector.analyse(cloud), THRESHOLD)
-    decision = part_decision(result, (TOLERANCE,), None, "")
+    decision = part_decision(result, (TOLERANCE,), Missed(""))
     decisions = [finding.decision for finding in decision.findings if finding.id == 1]
     return Decided(true_mm, decisions[0] if decisions else CONFORMS)
 
 
-def cut(cloud: Cloud, mask: np.ndarray, expected: object = None) -> Cloud:
+def cut(cloud: Cloud, mask: np.ndarray, expected: ExpectedSurface | None = None) -> Cloud:
     """Return the cloud without what lies beside the part."""
-    from dataclasses import replace
-
     points_m = np.where(mask[..., None], cloud.points_m, np.nan)
     return replace(cloud, points_m=points_m, expected=expected)
 
 
-def main(parts: int) -> None:
-    """Print the shares of wrong and of open decisions."""
+def reported(name: str, decisions: Sequence[Decided]) -> None:
+    """Print the shares of wrong decisions, with their 95 % intervals, and all decisions."""
+    print(f"compared with {name}: {len(decisions)} parts")
+    for beyond, kind in ((True, "accepted beyond the tolerance"), (False, "rejected within it")):
+        group = [each for each in decisions if (each.true_mm > TOLERANCE.limit_mm) == beyond]
+        wrong = sum(each.is_wrong for each in group)
+        low, high = intervals.wilson(wrong, len(group))
+        print(f"  {kind}: {wrong} of {len(group)} ({100 * low:.1f} to {100 * high:.1f} %)")
+    print(f"  {dict(Counter(each.decision for each in decisions))}", flush=True)
+
+
+def main(first: int, last: int) -> None:
+    """Decide on parts ``first`` to ``last`` - 1 and report every hundred."""
     good, mask = cloud_of(MadePart(), pose(), seed=1)
     reference = scan_of(good, mask, "one good part")
-    for name, scan in (("a smooth surface", None), ("one good part", reference)):
-        decisions = [decided_on(number, scan) for number in range(parts)]
-        print(f"compared with {name}")
-        for beyond, kind in ((True, "accepted beyond the tolerance"), (False, "rejected within")):
-            group = [d for d in decisions if (d.true_mm > TOLERANCE.limit_mm) == beyond]
-            wrong = sum(d.is_wrong for d in group)
-            low, high = intervals.wilson(wrong, len(group))
-            share = f"{100 * low:.1f} to {100 * high:.1f} %"
-            print(f"  {kind}: {wrong} of {len(group)} ({share})")
-        print(f"  {dict(Counter(d.decision for d in decisions))}")
+    for name, scan in (("one good part", reference), ("a smooth surface", None)):
+        decisions = []
+        for number in range(first, last):
+            decisions.append(decided_on(number, scan))
+            if (number + 1) % 100 == 0 or number + 1 == last:
+                reported(name, decisions)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 300)
+    numbers = [int(word) for word in sys.argv[1:]] or [300]
+    main(0 if len(numbers) == 1 else numbers[0], numbers[-1])

@@ -3,6 +3,8 @@ expected of it is the surface that was recorded."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -110,10 +112,13 @@ def test_mistakes_are_told() -> None:
         arched_scan = scan_of(arched, arched_mask, "part 1")
         good_parts(SCAN, [(arched_scan, None)], central=True)
     corner = mask.copy()
-    corner[:, 75:] = False
-    corner[60:] = False
+    corner[:, 90:] = False
+    corner[72:] = False
     with pytest.raises(UserError, match=r"corner: shows \d+ % of the part"):
         laid_under(scan_of(flat, corner, "corner"), flat, mask)
+    in_metres = replace(EARLIER, points_m=1e3 * EARLIER.points_m)
+    with pytest.raises(UserError, match=r"metres: is 1\.7\d*e\+05 mm large, and this part 17\d mm"):
+        laid_under(scan_of(in_metres, EARLIER_MASK, "metres"), flat, mask)
     detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"shape": "expected"}})
     with pytest.raises(UserError, match="the cloud has none"):
         detector.analyse(flat)

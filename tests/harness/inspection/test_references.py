@@ -16,6 +16,7 @@ from harness.inspection.arguments import is_mesh
 from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change
 from harness.inspection.references import captures_in
 from tests.harness.inspection.test_verdict import finding
+from tests.support import marked_board
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
 
 THEN = MadePart((Dent(0, 0, 14, 1.0), Dent(20, -30, 12, 2.5), Dent(-15, -30, 12, 1.5)))
@@ -82,11 +83,46 @@ def test_features_of_good_parts_are_no_findings(
     assert "on 4 good parts, each left out once" in capsys.readouterr().out
 
 
+def test_an_earlier_inspection_is_a_reference(captures: Path) -> None:
+    then = [str(captures / "then"), *OPTIONS, "--crop", "box:-70,70,-50,50,300,450"]
+    assert detect.main([*then, "--out", str(captures / "result")]) == 0
+    data = inspected(captures, "result", "since_result")
+    # a cloud without a grid shows no frames, but the same change
+    assert data["change"]["damage"][0]["state"] == GROWN
+    assert data["change"]["damage"][0]["distance_mm"] == pytest.approx(1.5, abs=0.15)
+
+
+def test_marks_place_a_flat_board(tmp_path: Path) -> None:
+    for name, turn_deg, seed in (("then", 0.0, 1), ("now", 12.0, 2)):
+        pose_of_board = marked_board.T_camera_board(turn_deg)
+        marked_board.write_view(tmp_path / name, pose_of_board, seed=seed)
+    arguments = [str(tmp_path / "now"), "--reference", str(tmp_path / "then")]
+    arguments += ["--detector", "local", "--marks", "red", "--out", str(tmp_path / "out")]
+    assert detect.main(arguments) == 0
+    data = json.loads((tmp_path / "out" / "findings.json").read_text())
+    facts = data["surface"]["reference"]
+    assert facts["placed_by"] == "marks and surface"
+    true = marked_board.T_camera_board(0.0) @ np.linalg.inv(marked_board.T_camera_board(12.0))
+    change = np.array(facts["T_reference_camera"]) @ np.linalg.inv(true)
+    middle_mm = np.array(facts["covariance_about_mm"])
+    away_mm = change[:3, :3] @ middle_mm + 1e3 * change[:3, 3] - middle_mm
+    stated_mm = 1e3 * np.sqrt(np.diag(np.array(facts["covariance"])))[3:]
+    # along the board, which has no relief, by five strips that each capture shifts by a millimetre
+    assert stated_mm[:2] == pytest.approx([np.sqrt(2 / 5)] * 2, rel=0.1)
+    assert (np.abs(away_mm) < 3 * stated_mm).all()
+
+
 def test_the_kind_of_a_reference_is_seen(captures: Path, tmp_path: Path) -> None:
     assert captures_in(captures / "then") == ()
     assert [path.name for path in captures_in(captures / "good")] == [
         f"part{number}" for number in range(4)
     ]
+    for name, count in (("a.mkv", 2), ("b.ply", 0)):
+        folder = tmp_path / name
+        folder.mkdir()
+        for number in (1, 2):
+            (folder / f"{number}{name[1:]}").touch()
+        assert len(captures_in(folder)) == count
     box = trimesh.creation.box((1, 1, 1))
     box.export(tmp_path / "part.ply")
     trimesh.PointCloud(box.vertices).export(tmp_path / "scan.ply")

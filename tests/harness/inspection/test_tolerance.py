@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from harness import detect
-from harness.inspection.limit import Limit
+from harness.inspection.limit import Limit, SizeCount
 from harness.inspection.tolerance import (
     CONFORMS,
     FAILS,
@@ -19,6 +20,7 @@ from harness.inspection.tolerance import (
     UNDECIDED,
     Contribution,
     FindingDecision,
+    Missed,
     PartDecision,
     Tolerance,
     _doubt,
@@ -32,7 +34,14 @@ from tests.support.made_parts import Dent, MadePart, pose, write_capture
 from tests.validation.tolerance_risks import decided_on
 
 DEPTH = Tolerance("depth", 0.5)
-FOUND = Limit((), 5.0, 6.0, "damage 0.5 mm deep is found")
+FOUND = Missed("so much is missed", Limit((), 5.0, 6.0, ""))
+NOTHING_FOUND = Missed("so much is missed", Limit((), math.nan, math.nan, ""))
+
+
+def at_both(hits: int) -> Missed:
+    """A share of discs at both tolerances that is found, where the width's bound is known."""
+    count = SizeCount(8.0, 0.5, hits, 40, 0.0, 1.0)
+    return Missed("so much is missed", Limit((), 5.0, 6.0, ""), count)
 
 
 @pytest.mark.parametrize(
@@ -67,18 +76,28 @@ def test_contributions_add_as_squares() -> None:
         ((CONFORMS, UNDECIDED), FOUND, UNDECIDED),
         ((CONFORMS,), FOUND, CONFORMS),
         ((), FOUND, CONFORMS),
-        ((), None, UNDECIDED),
-        ((), Limit((), math.nan, math.nan, "no implanted damage was found"), UNDECIDED),
+        ((), Missed("so much is missed"), UNDECIDED),
+        ((), NOTHING_FOUND, UNDECIDED),
+        ((), at_both(38), CONFORMS),  # 95 %
+        ((), at_both(37), UNDECIDED),
     ],
 )
 def test_the_part_is_as_its_worst_finding_and_what_was_missed(
-    decisions: tuple[str, ...], missed: Limit | None, decision: str
+    decisions: tuple[str, ...], missed: Missed, decision: str
 ) -> None:
     found = tuple(on(number, each) for number, each in enumerate(decisions, start=1))
-    part = PartDecision((DEPTH,), found, missed, "so much is missed", "")
+    part = PartDecision((DEPTH,), found, missed, "")
     assert part.decision == decision
     assert part.facts["decision"] == decision
     assert part.sentence.endswith("so much is missed.")
+
+
+def test_the_sentence_names_the_findings() -> None:
+    found = (on(1, FAILS), on(2, UNDECIDED), on(3, FAILS), on(4, CONFORMS))
+    part = PartDecision((DEPTH, Tolerance("width", 4.0)), found, FOUND, "")
+    start = "The part does not conform to a depth of at most 0.5 mm and width of at most 4 mm"
+    assert part.short == f"{start} (findings 1 and 3; undecided: finding 2)"
+    assert "a growth in depth" in replace(part, since="the earlier capture").short
 
 
 def test_doubts_about_a_decision() -> None:
@@ -118,13 +137,15 @@ def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> No
     write_capture(tmp_path / "now", now, pose((2.0, 1.0, 2.0)), seed=2)
     arguments = [str(tmp_path / "now"), "--unit", "m", "--detector", "local"]
     arguments += ["--reference", str(tmp_path / "then"), "--tolerance", "depth=0.5mm"]
+    arguments += ["--tolerance", "width=12mm"]
     assert detect.main([*arguments, "--out", str(tmp_path / "out")]) == 0
     data = json.loads((tmp_path / "out" / "findings.json").read_text())
     tolerance = data["tolerance"]
     assert tolerance["decision"] == FAILS
     assert tolerance["since"] == "the earlier capture"
     states = {change["id"]: change["state"] for change in data["change"]["damage"]}
-    failing = [each["id"] for each in tolerance["findings"] if each["decision"] == FAILS]
+    of_depth = [each for each in tolerance["findings"] if each["kind"] == "depth"]
+    failing = [each["id"] for each in of_depth if each["decision"] == FAILS]
     # the old dent is the same in both captures, and the one that was filled is no damage now
     assert [states[number] for number in failing] == ["new"]
     names = [entry["name"] for entry in tolerance["findings"][0]["contributions"]]
@@ -135,4 +156,8 @@ def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> No
         "registration",
     ]
     page = (tmp_path / "out" / "report.html").read_text()
+    missed = tolerance["missed"]
+    assert (missed["at_both"]["diameter_mm"], missed["at_both"]["depth_mm"]) == (12.0, 0.5)
+    assert missed["at_both"]["hits"] == missed["at_both"]["places"] >= 20
+    assert "a dent 0.5 mm deep and 12 mm wide is found with probability 1.00" in missed["text"]
     assert "Within tolerance?" in page and "ISO 14253-1" in page and "signature" in page
