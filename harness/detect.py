@@ -45,11 +45,11 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     )
     setting = "a setting of the detector by dotted path: surface.degree=5"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
-    mesh = (
-        "mesh of the undamaged part, registered to the cloud; --set surface.reference.unit=m, "
-        ".front=-y"
+    reference = (
+        "what the part should look like: an earlier capture of it, a folder of captures of good "
+        "parts, or a mesh (--set surface.reference.unit=m, .front=-y)"
     )
-    add("--reference", metavar="MESH", help=mesh)
+    add("--reference", type=Path, metavar="WHAT", help=reference)
     averages = ("mean", "median", "clipped")
     add(
         "--average",
@@ -79,6 +79,11 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
         "sizes"
     )
     add("--limit", nargs="?", const="", metavar="DEPTH", help=limit)
+    tolerance = (
+        "decide whether damage and part conform: depth=0.5mm, width=4mm (ISO 14253-1, with the "
+        "whole uncertainty; takes the analyses of --limit)"
+    )
+    add("--tolerance", action="append", default=[], metavar="SIZE", help=tolerance)
     add = parser.add_argument_group(
         "several views of one target",
         "Each PATH is one view. --crop cuts the target out of each view, and the detector "

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 from harness.runs.options import add_engine_options, engine_options
-from harness.vocabulary.program import program
+from harness.vocabulary.program import loading, program
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -52,12 +52,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if trials failed, 2 for a user's mistake, 130 after Ctrl-C."""
     run_options = engine_options(options)
-    if not (options.dry_run or run_options.serial or run_options.scheduler):
-        from harness.runs.processes import start_server
-
-        start_server()
-    from harness.experiment.load import load_experiment
-    from harness.experiment.schema import CaptureSource
+    with loading():
+        from harness.experiment.load import load_experiment
+        from harness.experiment.schema import CaptureSource
 
     experiment = load_experiment(
         options.experiment, options.overrides, options.calibration, quick=options.quick
@@ -70,7 +67,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         from harness.runs.estimate import dry_run
 
         return dry_run(experiment, options.out, run_options)
-    from harness.runs.study import run_study
+    with loading():
+        from harness.runs.study import run_study
 
     return run_study(experiment, options.out, run_options, command)
 

@@ -139,6 +139,7 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
         target.write_bytes(b"") if isinstance(target, Path) else target.write("<svg></svg>")  # type: ignore[attr-defined]
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+    monkeypatch.setattr("harness.report.blocks._lay_out", lambda _figure: None)
 
 
 @pytest.fixture(scope="session")

@@ -62,6 +62,7 @@ ONLY_PARSED = {
     "compare A B": "stands for two folders; test_compare runs the program",
     "artefacts --": "makes answers of the checkout again; test_making runs it elsewhere",
     "yours.yaml": "stands for the reader's own file",
+    "captures/part --reference": "needs captures of parts that are alike; test_references runs it",
 }
 
 
@@ -248,7 +249,6 @@ SMALL = {
     "anatomy": (
         "repeats=2",
         "threshold.calibrate.repeats=2",
-        "capture.exact=false",
         "sweep={capture.frames: [1]}",
     ),
     "perspectives": (*SMALL_REPEATS, "capture.frames=5", "sweep={mapping.views: [1, 2]}"),

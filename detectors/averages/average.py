@@ -436,16 +436,18 @@ def _one_scene(stack: np.ndarray, change_m: float) -> np.ndarray:
 def _changed_share(first: np.ndarray, second: np.ndarray, change_m: float) -> float:
     """Return the share of blocks (b, s) whose median difference is off the common one by more than
     ``change_m``, and by more than pixels scatter within blocks, as noise that neighbours share may
-    be; 0 if too few blocks have distances in both frames."""
+    be; 0 if it is below `OTHER_SCENE` or too few blocks have distances in both frames."""
     differences = first - second
     counts = np.isfinite(differences).sum(axis=1)
     known = differences[2 * counts > differences.shape[1]]
     if len(known) < FEWEST_BLOCKS:
         return 0.0
-    of_blocks = np.nanmedian(known, axis=1)
+    of_blocks = pixel_medians(known.T)
+    moved_m = np.abs(of_blocks - np.median(of_blocks))
+    if np.mean(moved_m > change_m) < OTHER_SCENE:
+        return 0.0  # a larger limit leaves fewer still
     scatter_m = _median_finite(np.abs(known - of_blocks[:, None])) / 0.6745
-    limit_m = max(change_m, scatter_m)
-    return float(np.mean(np.abs(of_blocks - np.median(of_blocks)) > limit_m))
+    return float(np.mean(moved_m > max(change_m, scatter_m)))
 
 
 def _shifts(sampled: np.ndarray) -> np.ndarray:

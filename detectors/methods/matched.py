@@ -15,10 +15,10 @@ template are then divided by their own deviation, separately for each distance f
 raised (`detectors.findings.templates.Worth`). Slots are scored on every second pixel, and around
 each of their peaks the best of many others is looked for (`detectors.methods.slots`).
 
-Strong findings are removed (their pixels count as unknown) and the rest is judged again, so that
-no filter sees the shoulder of a neighbouring hole. What pixels along the target's outline share
-beyond those farther in is subtracted. Upsampled depth is judged on squares of pixels in which its
-noise reaches no farther than a camera's window.
+Strong findings are removed (their pixels count as unknown) and the rest is judged again, until
+none is left, so that no filter sees the shoulder of a neighbouring hole or peaks between two. What
+pixels along the target's outline share beyond those farther in is subtracted. Upsampled depth is
+judged on squares of pixels in which its noise reaches no farther than a camera's window.
 
 Not modelled: slots within `RIM_PX` of outlines and of removed findings; distortion of templates on
 steep surfaces; missing returns, except the few that are not findings by themselves
@@ -65,6 +65,7 @@ MODEST_SIGMAS = local.LEVEL_SIGMAS  # limit to which residuals are clipped there
 # --- strong findings, which are removed before the rest is judged again ---
 
 STRONG = 6.0  # least score of their peaks
+MOST_ROUNDS = 6  # of removing them and judging the rest
 LOUD_SIGMAS = 3.0  # least residual of the pixels that are connected to such a peak
 LOUD_SHARE = 0.5  # the loud pixels at a peak fill at least this share of its template's disc
 MARGIN_PX = 2  # what is removed around loud pixels
@@ -103,7 +104,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 12
+    version = 13
 
     def __init__(
         self,
@@ -399,34 +400,17 @@ def _judged(
     )
     tamed = _tamed(residuals.values)
     radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
-
-    # the strong findings, weakest first
-    first = _scored(tamed, known, noise)
-    size = np.abs(first.signed)
-    peaks = np.argwhere((size > STRONG) & _highest(size))
-    peaks = peaks[np.argsort(size[tuple(peaks.T)], kind="stable")]
-    strong = size[tuple(peaks.T)]
-    strong_radius_px = radius_px[first.template[tuple(peaks.T)]]
-    discs = np.zeros(known.shape, np.uint8)
-    for (row, column), radius in zip(peaks.tolist(), strong_radius_px.tolist(), strict=True):
-        cv2.circle(discs, (column, row), round(radius), 1, cv2.FILLED)
-    core, heights, peak_of = _cores(peaks, strong_radius_px, residuals.values, known)
-
-    # the rest; where much is removed, the first solution is a poor start
-    if core.any():
-        rest = known & ~grown(core, MARGIN_PX)
-        second = _scored(tamed * rest, rest, noise, discs > 0, None)
-    else:
-        second = _scored(tamed * known, known, noise, discs > 0, first.solved)
+    strong = _strong_findings(residuals.values, tamed, known, noise)
+    rest = known & ~grown(strong.core, MARGIN_PX)
+    second = _scored(tamed * rest, rest, noise, strong.discs, strong.solved)
     signed = second.signed
+    _fill_discs(signed, radius_px[second.template])
+    signed *= known
     # only now are deviations known; among those of round templates, that of the narrowest is known
     # best
     is_slot = np.array([template.slot is not None for template in templates.bank(window_px)])
     deviations = np.where(is_slot, second.deviations, second.deviations[0])
-    strong = strong / deviations[first.template[tuple(peaks.T)]]
-    _fill_discs(signed, radius_px[second.template])
-    signed *= known
-    signed[core] = heights[core] * strong[peak_of[core]]
+    signed[strong.core] = (strong.signed / deviations[strong.template])[strong.core]
     scores = (signed * ~_side_lobes(signed)).astype(np.float64)
     return scores, noise.worths[0].energy ** -0.5
 
@@ -471,49 +455,106 @@ def _highest(size: np.ndarray) -> np.ndarray:
     return size >= cv2.dilate(size, np.ones((2 * ALONE_PX + 1,) * 2, np.uint8))
 
 
+class _Strong(NamedTuple):
+    """The strong findings of a picture."""
+
+    core: np.ndarray
+    """(r, c) bool: their pixels."""
+    signed: np.ndarray
+    """(r, c): scores of these pixels, 0 elsewhere."""
+    template: np.ndarray
+    """(r, c): number of the template with the highest score of a pixel's finding, 0 elsewhere."""
+    discs: np.ndarray
+    """(r, c) bool: discs of these templates around their peaks, and of those of other peaks that
+    are as high over quiet pixels."""
+    solved: np.ndarray | None
+    """(r, c): C^-1 r; None if pixels were removed since."""
+
+
+def _strong_findings(
+    values: np.ndarray,
+    tamed: np.ndarray,
+    known: np.ndarray,
+    noise: _Noise,
+) -> _Strong:
+    """Find strong findings among residuals (r, c) in deviations, and among the `_tamed`.
+
+    A neighbour's shoulder raises or hides what lies beside it, and a template may peak between two
+    holes. So each loud part is judged by its own highest score, and once the strong ones are
+    removed the rest is judged again, until no part of it is strong."""
+    core = np.zeros(known.shape, bool)
+    signed = np.zeros(known.shape)
+    template = np.zeros(known.shape, np.uint8)
+    discs = np.zeros(known.shape, np.uint8)
+    radius_px = np.array([template.radius_px for template in templates.bank(noise.window_px)])
+    for _ in range(MOST_ROUNDS):
+        rest = known & ~grown(core, MARGIN_PX)
+        scores = _scored(tamed * rest, rest, noise)
+        found = _cores(scores.signed, radius_px[scores.template], values, rest)
+        for part in found:
+            core[part.cut] |= part.inside
+            signed[part.cut][part.inside] = part.signed
+            template[part.cut][part.inside] = scores.template[part.peak]
+        size = np.abs(scores.signed)
+        quiet_peaks = np.argwhere((size > STRONG) & _highest(size)).tolist()
+        for row, column in [part.peak for part in found] or quiet_peaks:
+            radius = round(float(radius_px[scores.template[row, column]]))
+            cv2.circle(discs, (column, row), radius, 1, cv2.FILLED)
+        if not found:
+            break
+    # where much is removed, the rough solution is a poor start
+    solved = None if core.any() else scores.solved
+    return _Strong(core, signed, template, discs > 0, solved)
+
+
+class _Core(NamedTuple):
+    """The pixels of a strong finding."""
+
+    cut: tuple[slice, slice]
+    """The rectangle around them in the picture."""
+    inside: np.ndarray
+    """(h, w) bool: these pixels in the rectangle."""
+    signed: np.ndarray
+    """(n,): their scores, in proportion to the values over 3 x 3 pixels, so that two holes that
+    touch keep two peaks."""
+    peak: tuple[int, int]
+    """Row and column of the highest score."""
+
+
 def _cores(
-    peaks: np.ndarray,
+    signed: np.ndarray,
     radius_px: np.ndarray,
     values: np.ndarray,
     known: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixels of strong findings.
-
-    These are the loud pixels under ``peaks`` (n, 2), weakest first, and what lies between them,
-    where they fill half of a disc of the template's ``radius_px`` (n,).
-
-    Returns:
-        (r, c) bool, these pixels; their signed heights (r, c), up to 1, in proportion to the
-        ``values`` over 3 x 3 pixels, so that two holes that touch keep two peaks; and each pixel's
-        peak (r, c)."""
-    core = np.zeros(known.shape, bool)
-    signed = np.zeros(known.shape)
-    peak_of = np.zeros(known.shape, np.intp)
+) -> list[_Core]:
+    """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c)
+    above `STRONG` of their sign that is no side lobe, and which fill half of the disc of its
+    template's ``radius_px`` (r, c)."""
     loud = known & (np.abs(values) > LOUD_SIGMAS)
-    smooth = cv2.blur(values, (3, 3))
+    smooth = cv2.blur(values * known, (3, 3))
     smooth = smooth / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 0.1)
+    around = cv2.dilate(np.abs(signed), np.ones((2 * RIM_PX + 1,) * 2, np.uint8))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(grown(loud, 1).astype(np.uint8))
-    areas = stats[:, cv2.CC_STAT_AREA]
-    highest = np.full(count, -1)
-    for peak, (row, column) in enumerate(peaks.tolist()):
-        least_area = LOUD_SHARE * np.pi * radius_px[peak] ** 2
-        beside = parts[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        for number in np.unique(beside):
-            if number > 0 and areas[number] > least_area:
-                highest[number] = peak
-    for number in np.flatnonzero(highest >= 0):
-        left, top, width, height = stats[number, :4]
+    cores = []
+    for number in range(1, count):
+        left, top, width, height, area = stats[number].tolist()
         cut = np.s_[top : top + height, left : left + width]
-        part = (parts[cut] == number) & known[cut]
-        heights = smooth[cut][part].astype(np.float64)
-        # quiet pixels between loud ones are not a finding of the other sign
+        inside = (parts[cut] == number) & known[cut]
+        heights = smooth[cut][inside].astype(np.float64)
         side = np.sign(heights[np.abs(heights).argmax()])
+        own = np.where(inside, side * signed[cut], 0.0)
+        row, column = np.unravel_index(own.argmax(), own.shape)
+        score = float(own[row, column])
+        peak = int(top + row), int(left + column)
+        least = max(STRONG, LOBE_SHARE * float(around[peak]))
+        if score <= least or area <= LOUD_SHARE * np.pi * radius_px[peak] ** 2:
+            continue
+        # quiet pixels between loud ones are not a finding of the other sign
         one_sided = side * np.maximum(side * heights, 0.0)
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, one_sided)
-        signed[cut][part] = heights / np.abs(heights).max()
-        peak_of[cut][part] = highest[number]
-        core[cut] |= part
-    return core, signed, peak_of
+        scores = score * heights / np.abs(heights).max()
+        cores.append(_Core(cut, inside, scores, peak))
+    return cores
 
 
 # --- the scores of all templates ---

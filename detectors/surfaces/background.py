@@ -34,7 +34,7 @@ from detectors.surfaces.surface import (
     quadric,
 )
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Cloud
+from harness.vocabulary.geometry import MM, Cloud, ExpectedSurface
 
 MOST_CELLS = 3600
 CELL_POINTS = 16  # least number of points in a cell
@@ -59,7 +59,7 @@ noise grows."""
 FREE_FORM_FROM = 0.02  # share of the area with structure from which a free form is tried
 MISFIT_FROM = 0.1
 """Share of the area with structure from which a warning of a misfit is given."""
-STATED = ("polynomial", "mesh")  # shapes that the user states
+STATED = ("polynomial", "mesh", "expected")  # shapes that the user states
 STRUCTURE_CELLS = 5  # side of the block averaged to see structure
 STRUCTURE_SIGMAS = 4.0  # least significance of structure
 SEEN = 0.5
@@ -168,10 +168,14 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     central = cloud.projection == "central"
     cells = _cells(points, cloud)
     if cells is None:
-        return _of_few_points(points, mask, config, central)
+        return _of_few_points(cloud, points, mask, config)
     wavelength = None
     profile = None
-    if config.shape in STATED:
+    reference = _reference(cloud, points, config)
+    if reference is not None:
+        name = reference.text
+        fit = reference.z_at
+    elif config.shape in STATED:
         name, fit = _stated(points, config, central)
     else:
         shape, cells, profile = _shape_of(points, cells, config, rounding_floor(cloud, mask))
@@ -192,6 +196,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
     notes.update(shape=name, steep_share=float(unseen.mean()))
+    if reference is not None:
+        notes["reference"] = reference.facts
     text = name
     scale_m = None
     if wavelength is not None:
@@ -199,10 +205,14 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
     if unseen.mean() > 0.001:
         steep = f"seen at more than {STEEPEST_DEG:g} degrees"
-        if config.shape == "mesh":
-            steep += " or at an edge of the mesh"
+        if reference is not None:
+            steep += " or at an edge of the reference"
         text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
-    spread_m = np.zeros(len(points)) if profile is None else profile.spread_at(points)
+    spread_m = np.zeros(len(points))
+    if profile is not None:
+        spread_m = profile.spread_at(points)
+    elif reference is not None and config.shape == "expected":
+        spread_m = _spread_of(reference, points, unseen)
     return Background(
         surface_z_m=on_grid(fitted, mask),
         residual_m=on_grid(points[:, 2] - fitted, mask),
@@ -216,15 +226,17 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
 
 
 def _of_few_points(
-    points: np.ndarray,
-    mask: np.ndarray,
-    config: SurfaceConfig,
-    central: bool,
+    cloud: Cloud, points: np.ndarray, mask: np.ndarray, config: SurfaceConfig
 ) -> Background:
     """Return the stated surface, or a plane, behind points (n, 3) that are too few to judge it."""
-    if config.shape not in STATED:
-        config = SurfaceConfig(degree=1)
-    name, fit = _stated(points, config, central)
+    reference = _reference(cloud, points, config)
+    if reference is not None:
+        name = reference.text
+        fit = reference.z_at
+    else:
+        if config.shape not in STATED:
+            config = SurfaceConfig(degree=1)
+        name, fit = _stated(points, config, cloud.projection == "central")
     fitted = fit(points)
     residuals = points[:, 2] - fitted
     noise_m = sigma_of(residuals)
@@ -238,6 +250,28 @@ def _of_few_points(
         warning=f"{len(points)} points are too few to tell whether the surface ({name}) fits",
         notes={"shape": name, "local_noise_m": noise_m, "misfit_share": None},
     )
+
+
+def _reference(cloud: Cloud, points: np.ndarray, config: SurfaceConfig) -> ExpectedSurface | None:
+    """Return the surface that a reference says points (n, 3) of the cloud should show; None if the
+    surface is fitted to them. Raises UserError if the cloud has none."""
+    if config.reference is not None:
+        return laid_on(points, config.reference, cloud.projection == "central")
+    if config.shape != "expected":
+        return None
+    if cloud.expected is None:
+        raise UserError(
+            "surface.shape: expected compares with a reference, and the cloud has none",
+            fix="state it with --reference of tofpod detect, or choose another shape",
+        )
+    return cloud.expected
+
+
+def _spread_of(reference: ExpectedSurface, points: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """Return the standard deviation (n,) of the reference at points (n, 3) by its noise, by how
+    parts differ and by its placement; 0 where nothing is judged."""
+    spread_m = np.hypot(reference.spread_at(points), reference.registration_at(points))
+    return np.where(unseen, 0.0, spread_m)
 
 
 def _shape_of(
@@ -329,10 +363,8 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
 
 
 def _stated(points: np.ndarray, config: SurfaceConfig, central: bool) -> tuple[str, Fit]:
-    """Return the name and the fit of a surface whose kind is stated. ``central``: rays leave the
+    """Return the name and the fit of a polynomial that is stated. ``central``: rays leave the
     origin, else along z."""
-    if config.reference is not None:
-        return laid_on(points, config.reference, central)
     surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
 
     def z_at(queries: np.ndarray) -> np.ndarray:

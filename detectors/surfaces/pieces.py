@@ -25,17 +25,23 @@ LEAST_PX = 100  # fewest pixels of a piece that is counted
 BEHIND = 0.5  # share of the lines that show a background from which pieces are separate parts
 
 
-def joined_pieces(masks: list[np.ndarray], points_m: np.ndarray, apart_m: float) -> list[list[int]]:
+def joined_pieces(
+    masks: list[np.ndarray],
+    points_m: np.ndarray,
+    apart_m: float,
+    surfaces: int,
+) -> list[list[int]]:
     """Return the numbers of the pieces of each surface, the first being the largest.
 
     Args:
         masks: (h, w) bool each, pieces, largest first.
         points_m: (h, w, 3), metres, NaN where nothing returned.
-        apart_m: distance from a surface within which a point belongs to it."""
+        apart_m: distance from a surface within which a point belongs to it.
+        surfaces: how many of the first pieces are surfaces; the others only join them."""
     samples = [_sample(mask, points_m) for mask in masks]
     free = [number for number in range(len(masks)) if len(samples[number])]
-    groups = [[number] for number in range(len(masks)) if not len(samples[number])]
-    while free:
+    groups = [[number] for number in range(surfaces) if not len(samples[number])]
+    while free and free[0] < surfaces:
         group = [free.pop(0)]
         joined = True
         while joined and free:

@@ -1,171 +1,145 @@
 """The part's own mesh as the undamaged surface: fitted to the cloud, it gives the point where each
 ray should end.
 
-The part's front axis is turned to the camera, upright or rolled by multiples of 90 degrees.
-Closest points, then closest planes, move it onto the cloud (Besl and McKay 1992; Chen and Medioni
-1992); points off the part count less (Tukey). Triangles that face away are left out. A part turned
-by more than about 30 degrees is not found. A direction that the mesh does not fix, such as a shift
-of a plane along itself, stays undetermined; no result depends on it."""
+The part's front axis is turned to the camera, upright or rolled by multiples of 90 degrees, and
+`detectors.surfaces.expected` moves it onto the cloud. Triangles that face away are left out. A part
+turned by more than about 30 degrees is not found."""
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from detectors.open3d_library import load_open3d
-from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
-from detectors.surfaces.surface import BISQUARE_TUNING, Fit, ReferenceConfig, bisquare_weights
+from detectors.surfaces.expected import (
+    LEAST_OVERLAP,
+    LOOSE,
+    Pose,
+    Triangles,
+    another_part,
+    closest_of,
+    expected,
+    fitted,
+    met,
+    normals_of,
+    sampled,
+    spacing,
+)
+from detectors.surfaces.surface import ReferenceConfig
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, rotate_vectors, transform_points
-from harness.vocabulary.meshes import front_first, read_mesh
+from harness.vocabulary.geometry import MM, ExpectedSurface
+from harness.vocabulary.meshes import UNITS_M, front_first, read_mesh
 
-SAMPLE = 4000
-STEPS = 20
-"""Number of steps by closest points (twice as many by distances follow, then as many by planes).
-"""
-LEAST_SCALE_M = 0.1 * MM
-FAR_M = 10.0
-EDGE_PX = 1.5  # pixels within this distance of a step or edge of the part are not judged
-BENT = 0.5
-"""Bend, in pixels, that makes an edge."""
-# a direction with a smaller share of the largest information is not fixed by the part
-LOOSE = 1e-6
+LARGER = 2.0
+"""Ratio of the target's size to the mesh's from which the mesh cannot be the part."""
+SMALLER = 10.0
+"""Ratio of the mesh's size to the target's from which its outline cannot place the target."""
 
 
 @lru_cache(maxsize=4)
-def front_of(reference: ReferenceConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (m, 3, 3) of a part's triangles, x right, y up, z to the camera, in
-    metres, and their unit normals (m, 3). Raises UserError if the file is not a mesh or no
-    triangle faces the front."""
+def front_of(reference: ReferenceConfig) -> Triangles:
+    """Return a part's triangles, x right, y up, z to the camera, in metres. Raises UserError if the
+    file is not a mesh or no triangle faces the front."""
     mesh = read_mesh(reference.file)
     corners = front_first(mesh, reference.unit, reference.front)[np.asarray(mesh.faces)]
-    first_side = corners[:, 1] - corners[:, 0]
-    second_side = corners[:, 2] - corners[:, 0]
-    normals = np.cross(first_side, second_side)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals_of(corners)
     if not (normals[:, 2] > 0).any():
         fix = "state its front, or turn its faces outwards"
         raise UserError(f"{reference.file}: none of its triangles faces {reference.front}", fix=fix)
-    return corners, normals
+    return Triangles(corners, normals, np.zeros((len(corners), 3)))
 
 
-def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> tuple[str, Fit]:
-    """Fit the part to points (n, 3) of the camera's frame. Return a text on the quality of the
-    fit, and the surface seen along rays from the lens (``central``) or along z. Raises UserError
-    as `front_of` does."""
-    corners, normals = front_of(reference)
-    ahead = normals[:, 2] > -LOOSE
-    part = _scene(corners)
-    front = _scene(corners[ahead])
-    sample = points[:: max(1, len(points) // SAMPLE)]
-    poses = [_fitted(front, corners[ahead], normals[ahead], sample, turn) for turn in range(4)]
-    T_part_camera, off_m, error_m = min(poses, key=lambda pose: pose[1])
-
-    pitch = _spacing(points / points[:, 2:] if central else points)
-
-    def met(rays: np.ndarray) -> np.ndarray:
-        """Return z where rays meet the part: from the lens through (n, 2) at z = 1, or along z at
-        (n, 2)."""
-        if central:
-            along = np.column_stack([rays, np.full(len(rays), 1.0)])
-            starts = np.zeros(along.shape)
-        else:
-            starts = np.column_stack([rays, np.full(len(rays), -FAR_M)])
-            along = np.eye(3)[[2] * len(rays)]
-        origin = transform_points(T_part_camera, starts)
-        ray = rotate_vectors(T_part_camera, along)
-        hits = part.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))
-        triangle = hits["primitive_ids"].numpy()
-        is_hit = triangle != part.INVALID_ID
-        number = np.where(is_hit, triangle, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reach = np.einsum("ni,ni->n", corners[number, 0] - origin, normals[number])
-            reach /= np.einsum("ni,ni->n", ray, normals[number])
-            return np.where(is_hit, starts[:, 2] + reach, np.nan)
-
-    def z_at(queries: np.ndarray) -> np.ndarray:
-        """Return z of the surface; NaN within `EDGE_PX` of a step, where a camera mixes both
-        sides."""
-        rays = queries[:, :2] / queries[:, 2:] if central else queries[:, :2]
-        z = met(rays)
-        side = EDGE_PX * pitch
-        bends = []
-        for shift in ([side, 0], [0, side]):
-            after = met(rays + np.array(shift))
-            before = met(rays - np.array(shift))
-            bends.append(after + before - 2 * z)
-        limit = BENT * pitch * (np.abs(z) if central else 1.0)
-        return np.where(np.abs(bends).max(axis=0) < limit, z, np.nan)
-
-    text = (
-        f"the mesh {Path(reference.file).name}, with half of the points within "
-        f"{off_m / MM:.2g} mm of it, placed along its normals within "
-        f"{error_m / MM:.2g} mm (standard error)"
+def laid_on(points: np.ndarray, reference: ReferenceConfig, central: bool) -> ExpectedSurface:
+    """Fit the part to points (n, 3) of the camera's frame. Return the surface seen along rays from
+    the lens (``central``) or along z. Raises UserError as `front_of` does."""
+    part = front_of(reference)
+    front = part.chosen(part.normals[:, 2] > -LOOSE)
+    sample = sampled(points)
+    _refuse_unit(reference, front, points)
+    poses = []
+    for turn in range(4):
+        poses.append(fitted(front, sample, _start(front, sample, turn)))
+    pose = closest_of(poses)
+    _refuse_other(reference, part, pose, sample, central)
+    return expected(
+        part,
+        pose,
+        pitch=spacing(points / points[:, 2:] if central else points),
+        central=central,
+        is_sharp=True,
+        text=_text(reference, pose),
+        facts={"median_off_m": pose.off_m, "standard_error_m": pose.error_m},
     )
-    return text, z_at
 
 
-def _spacing(points: np.ndarray) -> float:
-    """Return the side of a square with one of the points (n, 3), in x and y."""
-    extent = np.ptp(points[:, :2], axis=0)
-    return float(np.sqrt(np.prod(extent) / len(points)))
-
-
-def _scene(corners: np.ndarray) -> Any:
-    """Return triangles (m, 3, 3) as a scene for rays and closest points, identified by their
-    numbers."""
-    scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
-    faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
-    scene.add_triangles(corners.reshape(-1, 3).astype(np.float32), faces)
-    return scene
-
-
-def _fitted(
-    scene: Any,
-    corners: np.ndarray,
-    normals: np.ndarray,
-    points: np.ndarray,
-    turn: int,
-) -> tuple[np.ndarray, float, float]:
-    """Return T_part_camera, found from one rotation by a multiple of 90 degrees; the median
-    distance of the points (n, 3) from the part's planes; and the standard error of its position
-    along them, if the points are independent."""
+def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:
+    """Return T_part_camera (4, 4) of a part before the camera, rolled by quarters of a turn."""
     angle = turn * np.pi / 2
     c, s = np.rint([np.cos(angle), np.sin(angle)])
     roll = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[:3, :3] = roll @ T[:3, :3]
-    part_middle = np.median(corners.reshape(-1, 3), axis=0)
-    T[:3, 3] = part_middle - T[:3, :3] @ np.median(points, axis=0)
-    pitch_m = _spacing(points)
-    for step in range(4 * STEPS):
-        by_planes = step >= 3 * STEPS
-        moved = transform_points(T, points)
-        closest = scene.compute_closest_points(moved.astype(np.float32))
-        offsets = moved - closest["points"].numpy()
-        towards = normals[closest["primitive_ids"].numpy()]
-        if by_planes:
-            off = np.einsum("ni,ni->n", offsets, towards)
-            least_scale_m = LEAST_SCALE_M
-        else:  # a point beyond an edge attracts that edge
-            off = np.linalg.norm(offsets, axis=1)
-            lengths_m = np.maximum(off, LEAST_SCALE_M)[:, None]
-            towards = np.where(off[:, None] > LEAST_SCALE_M, offsets / lengths_m, towards)
-            least_scale_m = pitch_m
-        scale_m = max(float(np.median(np.abs(off))) / 0.6745, least_scale_m)
-        weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)
-        if step < STEPS:
-            T = kabsch(moved, moved - offsets, weight) @ T
-            continue
-        off = np.einsum("ni,ni->n", offsets, towards)
-        middle = moved.mean(axis=0)
-        slopes = np.einsum("ni,nij->nj", towards, displacement_jacobian(moved, middle))
-        weighted = (slopes * weight[:, None]).T
-        # no motion along a direction that the part does not fix
-        inverse = np.linalg.pinv(weighted @ slopes, rcond=LOOSE, hermitian=True)
-        T = moved_by(-inverse @ weighted @ off, middle) @ T
-    spread_m2 = float((weight * off**2).sum() / weight.sum())
-    variances = np.einsum("ni,ij,nj->n", slopes, inverse, slopes)
-    error_m = float(np.sqrt(spread_m2 * variances.mean()))
-    return T, float(np.median(np.abs(off))), error_m
+    T[:3, 3] = front.middle_m - T[:3, :3] @ np.median(points, axis=0)
+    return T
+
+
+def _refuse_unit(reference: ReferenceConfig, front: Triangles, points: np.ndarray) -> None:
+    """Raise UserError if points (n, 3) extend beyond the part or are a tiny piece of it, as in a
+    wrong unit of length."""
+    extent_m = _diagonal(points)
+    part_m = _diagonal(front.corners_m.reshape(-1, 3))
+    if part_m / SMALLER < extent_m < LARGER * part_m:
+        return
+    fitting = []
+    for unit, unit_m in UNITS_M.items():
+        ratio = part_m * unit_m / UNITS_M[reference.unit] / extent_m
+        if 1.0 / LARGER < ratio < LARGER:
+            fitting.append(unit)
+    fix = "name the mesh of this part, or choose its surface (--target, --crop)"
+    if fitting:
+        fix = (
+            f"state its unit, if it is {' or '.join(fitting)}: surface.reference.unit={fitting[0]}"
+        )
+    raise UserError(
+        f"{reference.file}: is {part_m / MM:.3g} mm large in {reference.unit}, and the target"
+        f" {extent_m / MM:.3g} mm",
+        legal=f"a target of {1 / SMALLER:g} to {LARGER:g} times the part's size",
+        fix=fix,
+    )
+
+
+def _diagonal(points: np.ndarray) -> float:
+    """Return the diagonal of the box around points (n, 3), without the outermost hundredth."""
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _refuse_other(
+    reference: ReferenceConfig,
+    part: Triangles,
+    pose: Pose,
+    points: np.ndarray,
+    central: bool,
+) -> None:
+    """Raise UserError if points (n, 3) are beside the placed part, or lie off it."""
+    rays = points[:, :2] / points[:, 2:] if central else points[:, :2]
+    z_m, variances_m2 = met(part, pose.T_part_camera, rays, central)
+    off_m = points[:, 2] - z_m
+    overlap = float(np.isfinite(off_m).mean())
+    doubt = f"it shows {100 * overlap:.0f} % of the target"
+    if overlap >= LEAST_OVERLAP:
+        doubt = another_part(points, off_m, variances_m2)
+    if doubt:
+        raise UserError(
+            f"{reference.file}: is not this part: {doubt}",
+            fix="name the mesh of this part, state its front (surface.reference.front) and unit, or"
+            " choose its surface (--target, --crop)",
+        )
+
+
+def _text(reference: ReferenceConfig, pose: Pose) -> str:
+    """Return how well the part fits, in words."""
+    return (
+        f"the mesh {Path(reference.file).name}, with half of the points within "
+        f"{pose.off_m / MM:.2g} mm of it, placed along its normals within "
+        f"{pose.error_m / MM:.2g} mm (standard error)"
+    )

@@ -159,11 +159,10 @@ def _with_pieces(
     for number in numbers:
         grown_core = grown(small == number, reach) & ~taken & np.isfinite(points_m[..., 2])
         pieces.append(grown_core)
-    groups = joined_pieces(pieces, points_m, apart_m)
+    groups = joined_pieces(pieces, points_m, apart_m, surfaces=len(masks))
     surfaces = []
     for group in groups:
-        if group[0] < len(masks):
-            surfaces.append(np.logical_or.reduce([pieces[number] for number in group]))
+        surfaces.append(np.logical_or.reduce([pieces[number] for number in group]))
     return np.array(surfaces)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numba
@@ -19,6 +20,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from detectors.pixels.clusters import PLAIN
 from detectors.pixels.noise import median_of
+from detectors.surfaces.interior_point import least_absolute
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
@@ -35,6 +37,7 @@ LTS_COVERAGE = 0.55  # fraction of points that the fit must explain: it tolerate
 LTS_SEED = 20201102
 LAR_THINNING = 12
 LAR_STEPS = 60
+REACHES = 3  # margins that are tried, each three times wider than the one before
 HALVINGS = 12
 KNEES = np.array([1.0, 0.1, 0.03, 0.003, 3e-4, 3e-5, 3e-6])
 """Knees of Huber's function, in units of the median |r|."""
@@ -59,8 +62,9 @@ class SurfaceConfig(Config):
     """The kind of surface that is fitted, and how."""
 
     # ``polynomial``, of the stated degree; ``auto``, the simplest of plane, polynomials, quadric
-    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's
-    shape: Literal["polynomial", "auto", "free_form", "mesh"] = "polynomial"
+    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's;
+    # ``expected``, what the cloud's own reference says
+    shape: Literal["polynomial", "auto", "free_form", "mesh", "expected"] = "polynomial"
     # the mesh that is fitted to the cloud
     reference: ReferenceConfig | None = None
     # width above which a free form follows the cloud
@@ -276,35 +280,55 @@ def _lar(
     start: np.ndarray,
     knees: np.ndarray = KNEES,
 ) -> Solution:
-    """Find the L1 solution by smoothing (Madsen and Nielsen 1993)."""
-    c = start
-    margin = np.inf
+    """Find the L1 solution by smoothing, on a sample first: most points lie on one side of both
+    surfaces, so that only those between them need many steps. Where the sample misleads, by an
+    interior point method, which takes five times as long as smoothing takes elsewhere."""
     few_basis, few_z = _thinned(basis, z, max(SAMPLE_POINTS, len(z) // LAR_THINNING))
-    if len(few_z) < len(z):
+    solution = None
+    if len(few_z) == len(z):
+        solution = _smoothed(basis, z, start, knees, np.inf)
+    else:
         c = _lar(few_basis, few_z, start, KNEES[:3])[0]
-        knees = knees[2:]
         # 5 standard errors of the thinned L1 solution, in units of the median |r|
         margin = 5.0 * 1.25 / 0.6745 * np.sqrt(len(basis) / len(few_z))
+        solution = _smoothed(basis, z, c, knees[2:], margin)
+    if solution is not None:
+        return solution
+    c, gap = least_absolute(basis, z, start, GAP_CONVERGED)
+    return c, _lar_note(gap)
+
+
+def _smoothed(
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    knees: np.ndarray,
+    margin: float,
+) -> Solution | None:
+    """Find the L1 solution by smoothing (Madsen and Nielsen 1993). Points farther than ``margin``
+    from the start, in units of the median |r|, keep their side of the surface; None if they do
+    not even for a margin nine times as wide."""
+    c = start
     r = z - c @ basis
     sample = r[:: max(1, len(r) // SAMPLE_POINTS)]
     scale = max(median_of(np.abs(sample)), TINY_M)
     for knee in scale * knees:
         enough = 0.001 * GAP_CONVERGED * float(np.abs(r).sum())
         reach = max(margin * scale, 10.0 * knee)
-        while True:
+        for _ in range(REACHES):
             far = np.abs(r) >= reach
             inliers = np.flatnonzero(~far)
             far_pull = basis @ np.where(far, np.sign(r), 0.0)
             rows = np.ascontiguousarray(np.take(basis, inliers, axis=1).T)
-            new = _smoothed_descent(rows, z[inliers], far_pull, c, knee, enough)
-            after = z - new @ basis
-            # a far point may have crossed the surface or come within its knee
-            is_near = (r * after <= 0.0) | (np.abs(after) < knee)
-            if not (far & is_near).any():
+            keeps_sides = partial(_keeps_sides, basis, z, c, r, far, knee, reach)
+            new = _smoothed_descent(rows, z[inliers], far_pull, c, knee, enough, keeps_sides)
+            if new is not None:
                 break
             reach *= 3.0
+        if new is None:
+            return None
         c = new
-        r = after
+        r = z - c @ basis
         margin = min(margin, 5.0 * knee / scale)
         sizes = np.abs(r)
         inside = sizes[sizes <= knee]
@@ -312,7 +336,31 @@ def _lar(
         gap = excess / max(float(sizes.sum()), TINY_M)
         if gap <= GAP_CONVERGED:
             break
-    return c, f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
+    return c, _lar_note(gap)
+
+
+def _lar_note(gap: float) -> str:
+    return f"least absolute residuals, within {min(gap, 1.0):.0e} of the least sum"
+
+
+def _keeps_sides(
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    r: np.ndarray,
+    far: np.ndarray,
+    knee: float,
+    reach: float,
+    c: np.ndarray,
+) -> bool:
+    """Return whether all points that lie ``far`` from the start's surface, at residuals r (n,),
+    lie on the same side of another surface, beyond its knee."""
+    # no product of Chebyshev polynomials exceeds 1
+    if np.abs(c - start).sum() < reach - knee:
+        return True
+    after = z - c @ basis
+    is_near = (r * after <= 0.0) | (np.abs(after) < knee)
+    return not (far & is_near).any()
 
 
 @numba.njit(**PLAIN)
@@ -364,9 +412,11 @@ def _smoothed_descent(
     start: np.ndarray,
     knee: float,
     enough: float,
-) -> np.ndarray:
+    keeps_sides: Callable[[np.ndarray], bool],
+) -> np.ndarray | None:
     """Minimise sum huber(r, knee) - c' far_pull by Newton steps, or by majorising steps, which
-    always descend."""
+    always descend. None as soon as far points do not keep their sides: their pull is then wrong,
+    and the sum may have no least value, so that the descent would never end."""
 
     def state(c: np.ndarray) -> _Descent:
         value, pull, inside = _huber(rows, z, c, knee)
@@ -397,6 +447,8 @@ def _smoothed_descent(
             moved = lower(current, direction)
         if moved is None or current.value - moved.value < enough:
             return current.c
+        if not keeps_sides(moved.c):
+            return None
         current = moved
     return current.c
 

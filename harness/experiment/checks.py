@@ -38,6 +38,7 @@ DETECTOR_NAME = ("detector", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
+LEAST_BOARDS = 10  # of a study with a precision: its first boards, and a batch of chosen sizes
 
 
 def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
@@ -101,6 +102,8 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
         yield Problem("a study needs a family of boards", source.place_of(TARGET), fix=fix)
     if config.study is None or not isinstance(target, DrawnTargetConfig):
         return
+    if config.study.precision is not None:
+        yield from _precision_problems(config, target, source)
     if config.sensitivity is not None:
         fix = "sweep the key, or run the study once for each value with --set"
         yield Problem(
@@ -139,6 +142,31 @@ def _study_problems(config: ExperimentConfig, source: Source) -> Iterator[Proble
             message = f"{boards} cannot show {rate_per_m2:g} false calls per m2"
             fix = "simulate more boards or larger ones, or ask for a higher false_calls_per_m2"
             yield Problem(message, boards_at, f"at least {needed}", fix=fix)
+
+
+def _precision_problems(
+    config: ExperimentConfig, target: DrawnTargetConfig, source: Source
+) -> Iterator[Problem]:
+    """Find what keeps the sizes of a study with a precision from being chosen."""
+    assert config.study is not None
+    position = source.key_place_of(("study", "precision"))
+    if config.study.boards < LEAST_BOARDS:
+        message = f"{config.study.boards} boards are too few for a precision"
+        fix = "with a precision, study.boards is the largest number of boards"
+        legal = f"at least {LEAST_BOARDS}"
+        yield Problem(message, source.place_of(("study", "boards")), legal=legal, fix=fix)
+    low_mm, high_mm = target.damage.limit_range_mm
+    if low_mm == high_mm:
+        message = f"all damages have a {target.damage.limit_of} of {low_mm:g} mm"
+        fix = "declare a range of sizes in source.target.damage, or remove study.precision"
+        yield Problem(f"{message}, so that no size can be chosen", position, fix=fix)
+    if config.unknowns:
+        message = "a study with a precision cannot draw unknowns"
+        fix = (
+            "write unknowns: [], or remove study.precision: what unknowns do shows only on boards "
+            "with sizes over the whole range"
+        )
+        yield Problem(message, position, fix=fix)
 
 
 def _target_problems(

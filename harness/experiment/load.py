@@ -105,6 +105,8 @@ def _quick(data: Any) -> list[str]:
             fewer = ceil(boards / 3)
             if path == calibration_boards:
                 fewer = min(boards, max(fewer, QUICK_CALIBRATION_BOARDS))
+            if path == "study.boards" and shape.get(data, ("study", "precision")):
+                fewer = min(boards, max(fewer, checks.LEAST_BOARDS))
             overrides.append(f"{path}={fewer}")
     return overrides
 

@@ -96,11 +96,6 @@ class CaptureConfig(Config):
         None,
         description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
-    exact: bool = Field(
-        False,
-        description="true simulates each frame; "
-        "false draws the mean if its distribution is the same",
-    )
 
 
 class DetectorConfig(Config):
@@ -210,13 +205,33 @@ class SensitivityConfig(Config):
     ]
 
 
+class PrecisionConfig(Config):
+    """The largest width of the 95 % interval of a90 from end to end, in mm or in percent of a90."""
+
+    a90_mm: Annotated[float, Field(gt=0, le=1000)] | None = None
+    a90_percent: Annotated[float, Field(gt=0, le=100)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_the_two(self) -> Self:
+        if (self.a90_mm is None) == (self.a90_percent is None):
+            raise ValueError("give either `a90_mm` or `a90_percent`, and not both")
+        return self
+
+
 class StudyConfig(Config):
     """A study of the probability of detection on random boards: ``boards`` have damage, and false
     calls are counted on ``hole_free_boards``. All set-ups inspect the same boards, each with
     ``repeats`` draws of noise. ``units`` are cameras with different fixed patterns: all of them
     inspect each damaged board, another one each hole-free board."""
 
-    boards: Boards
+    boards: Boards = Field(description="with a precision, the largest number of boards")
+    precision: PrecisionConfig | None = Field(
+        None,
+        description=(
+            "boards are added, with sizes about a50 and a90, until a90 is as precise; null: all "
+            "boards, with sizes over the whole range"
+        ),
+    )
     hole_free_boards: Boards
     units: Annotated[int, Field(ge=2, le=1000)] | None = Field(
         None,
@@ -225,6 +240,19 @@ class StudyConfig(Config):
             "unit alone"
         ),
     )
+    one_unit_calibrates: bool = Field(
+        False,
+        description=(
+            "source.camera.unit_seed sees all boards that teach detectors and set thresholds, "
+            "as if one camera were calibrated for others; false: each has a unit of its own"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _has_other_units(self) -> Self:
+        if self.one_unit_calibrates and self.units is None:
+            raise ValueError("`one_unit_calibrates` needs `units`: there are no others")
+        return self
 
 
 class ExperimentConfig(Config):
@@ -369,9 +397,12 @@ class Experiment:
             [point.variant, point.label, point.digest, point.config.repeats]
             for point in self.points
         ]
-        return digest(
-            points if self.config.study is None else [self.config.study.to_data(), *points]
-        )
+        if self.config.study is None:
+            return digest(points)
+        study = self.config.study.to_data()
+        if self.config.study.precision is None:
+            del study["precision"]  # results of studies without a precision keep their folders
+        return digest([study, *points])
 
     def at_stated_values(self) -> Experiment:
         """Return the experiment without the set-ups whose unknowns are drawn."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +22,16 @@ if TYPE_CHECKING:
     from detectors.interface import Detector
     from detectors.recordings import Recording
     from detectors.views.mapping.settings import MappingConfig
+    from detectors.views.marks.mark import MarksConfig
     from harness.vocabulary.geometry import Lens
 
 METHODS = ("marks", "icp", "cpd", "joint", "odometry", "nominal")
 MERGES = ("fusion", "grid", "volume")
 MARKS = ("colour", "red", "coded")
 WHOLE_CAPTURES = (".mcap", ".db3", ".mkv", ".npy", ".npz", ".mat", ".tif", ".tiff", ".pfm")
+MESHES = (".stl", ".obj", ".glb", ".step", ".stp", ".iges", ".igs")
+HEAD_BYTES = 4096
+"""Bytes of a .ply that hold its header."""
 DEFAULT_FALSE_CALLS = 1.0  # expected false calls in the capture
 DEFAULT_DETECTOR = "auto"
 """The detector is chosen on the capture among `CANDIDATES`."""
@@ -88,10 +93,17 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
     """Raise UserError for arguments of several views with one capture, and vice versa."""
     several = f"--register {'|'.join(METHODS)}"
+    reference = getattr(arguments, "reference", None)
+    is_compared = reference is not None and not is_mesh(reference)
+    if is_compared and arguments.quiet_capture is not None:
+        raise UserError(
+            "--quiet-capture and --reference: the threshold is that of a part that is compared with"
+            " the reference",
+            fix="leave out --quiet-capture; or record it among the good parts of --reference",
+        )
     if arguments.register is None:
-        given_options = [
-            name for name in ("merge", "marks", "poses") if getattr(arguments, name) is not None
-        ]
+        names = ["merge", "poses"] if is_compared else ["merge", "marks", "poses"]
+        given_options = [name for name in names if getattr(arguments, name) is not None]
         given_options += [
             f"set {assignment}" for assignment in arguments.set if assignment.startswith(PREFIX)
         ]
@@ -202,7 +214,9 @@ def detector_of(
     if reference is not None:
         if "surface" not in settings_type.model_fields:
             raise UserError(f"--reference {reference}: detector {name} has no surface setting")
-        settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
+        settings["surface"] = {"shape": "expected"}
+        if is_mesh(reference):
+            settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
     elif "surface" in settings_type.model_fields and not any(
         assignment.startswith(STATED_SURFACE) for assignment in assignments
     ):
@@ -210,6 +224,22 @@ def detector_of(
     for assignment in assignments:
         assign(settings, assignment)
     return load_detector(name, settings), settings_type.from_data(settings).to_data()
+
+
+def is_mesh(path: Path) -> bool:
+    """Return whether a reference is a drawing: a file of triangles or of CAD surfaces. A .ply may
+    also hold the points of a capture."""
+    suffix = path.suffix.lower()
+    if suffix != ".ply" or not path.is_file():
+        return suffix in MESHES
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+    except OSError:
+        # the reader of captures says why
+        return False
+    faces = re.search(rb"element face (\d+)", head)
+    return faces is not None and int(faces[1]) > 0
 
 
 def rate_text(arguments: argparse.Namespace) -> str:
@@ -242,6 +272,14 @@ def mapping_of(arguments: argparse.Namespace) -> MappingConfig:
         if assignment.startswith(PREFIX):
             assign(data, assignment.removeprefix(PREFIX))
     return settings_of(MappingConfig, data, "settings of the mapping", PREFIX.rstrip("."))
+
+
+def marks_of(arguments: argparse.Namespace) -> MarksConfig:
+    """Return the marks by which a part is placed on its reference: coded ones unless stated."""
+    from detectors.views.mapping.settings import MappingConfig
+
+    kind = arguments.marks or "coded"
+    return MappingConfig.from_data({"marks": {"kind": kind}}).marks
 
 
 def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from detectors.findings.beside_joints import (
     TouchingDamage,
     damage_beside,
@@ -18,7 +20,7 @@ from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
 from detectors.findings.null import RIM_PX, OwnThreshold, each_object_once, own_threshold
 from detectors.findings.odds import noise_probabilities
-from detectors.interface import Detection, Detector, Evidence, Measurement
+from detectors.interface import Detection, Detector, Evidence, Measurement, MissingReturns
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
 from harness.inspection.verdict import FalseCalls, calls_text, with_remarks
@@ -41,10 +43,17 @@ LEAST_AT_MARKS = 0.05
 """Fewest expected calls at marks that the output states: 0.1 when rounded."""
 
 
+LEAST_EXPECTED = 0.5
+"""Share of pixels without return at which the reference shows a surface, from which they are a
+finding."""
+
+
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage above a threshold and missing returns, each damage, each object and each set of
     joints once, measure them, and say how certain each is."""
     missing = missing_returns(cloud, evidence)
+    if missing is not None and cloud.expected is not None:
+        missing = _without_features(cloud, missing)
     without_return = () if missing is None else missing.detections
     above_threshold = detector.find(cloud, evidence, threshold)
     objects_once = each_object_once(cloud, evidence, above_threshold)
@@ -70,6 +79,20 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)
+
+
+def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:
+    """Leave out missing returns where the reference shows nothing either: openings of the part."""
+    if cloud.lens is None or cloud.expected is None:
+        return missing
+    slopes = cloud.lens.region_slopes(cloud.region).reshape(-1, 2)
+    kept = []
+    for detection in missing.detections:
+        rays = np.column_stack([slopes[detection.pixels], np.ones(len(detection.pixels))])
+        is_expected = np.isfinite(cloud.expected.z_at(rays))
+        if is_expected.mean() >= LEAST_EXPECTED:
+            kept.append(detection)
+    return replace(missing, detections=tuple(kept))
 
 
 def _measured(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -17,17 +18,26 @@ import numpy as np
 from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_agreement import places_doubt, refuse_unfit
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
-from detectors.crop import Choice, described_text
+from detectors.crop import Choice, NoCrop, described_text
 from detectors.interface import Detector, Evidence
 from detectors.pixels.noise import REACH_FRAMES, with_noise
 from detectors.surfaces.pieces import part_text, piece_facts
 from detectors.views.view import View
 from harness.inspection import arguments as cli
 from harness.inspection import output
+from harness.inspection.changes import Changes, changes_of
 from harness.inspection.choosing import Contender, candidate_of, chosen, noted
-from harness.inspection.judging import judged, refuse_thresholds
+from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
 from harness.inspection.limit import Limit, limit_of
+from harness.inspection.reference_page import changes_section, decision_section
+from harness.inspection.references import Reference, SeenPart, checked_on_parts, reference_of, seen
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
+from harness.inspection.tolerance import (
+    PartDecision,
+    Tolerance,
+    part_decision,
+    tolerances_from,
+)
 from harness.inspection.verdict import (
     CLASSES,
     FLAGS,
@@ -39,9 +49,10 @@ from harness.inspection.verdict import (
 from harness.records import outputs
 from harness.report.blocks import joined, paragraph, plain
 from harness.report.findings import Judged, write_findings
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import plain_json
 from harness.vocabulary.geometry import MM, Cloud
-from harness.vocabulary.provenance import record
+from harness.vocabulary.provenance import made_by, record
 from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
@@ -86,6 +97,12 @@ class Inspection:
     """The answer."""
     limit: Limit | None
     """The sizes that would have been missed; None if they were not asked for."""
+    reference: Reference | None
+    """The captures that the part is compared with; None for a drawing, or without a reference."""
+    changes: Changes | None
+    """What changed since an earlier capture; None without one."""
+    decision: PartDecision | None
+    """Whether the part is within its tolerances; None without --tolerance."""
 
     @property
     def cell_m(self) -> float | None:
@@ -114,6 +131,8 @@ class _Captured:
     """The content of registrations.json; empty for one capture."""
     cloud: Cloud
     """What is judged: the average, or the map."""
+    reference: Reference | None
+    """What it is compared with; None for a drawing, or without a reference."""
 
 
 def inspected(arguments: argparse.Namespace) -> Inspection:
@@ -123,6 +142,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
     cli.limit_depth_m(arguments)
+    tolerances = tolerances_from(arguments.tolerance)
     detectors = _detectors_of(arguments, config)
     capture = _captured(arguments, paths, config, detectors[0][0])
     candidate = _chosen(arguments, detectors, capture)
@@ -133,6 +153,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
     result = judged(candidate.detector, capture.cloud, evidence, candidate.threshold)
     outline = _outline(capture.choices, capture.mapped)
+    changes = _changes(arguments, config, capture, candidate.detector, result)
     return Inspection(
         arguments=arguments,
         recordings=capture.recordings,
@@ -148,6 +169,9 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
         threshold_origin=candidate.origin,
         verdict=verdict_of(result, candidate.threshold, outline),
         limit=_limit(arguments, candidate.detector, result, candidate.threshold),
+        reference=capture.reference,
+        changes=changes,
+        decision=_decision(candidate, result, tolerances, changes),
     )
 
 
@@ -185,6 +209,9 @@ def _captured(
         mapped = merged_views(arguments, config, recordings, views, choices)
         registrations = registration_data(mapped)
         cloud = mapped.merged.cloud
+    reference = _reference(arguments, config, detector, flat_field)
+    if reference is not None:
+        cloud = reference.under(_part(arguments, detector, cloud))
     return _Captured(
         recordings=recordings,
         quiet_recordings=quiet_recordings,
@@ -194,6 +221,63 @@ def _captured(
         mapped=mapped,
         registrations=registrations,
         cloud=cloud,
+        reference=reference,
+    )
+
+
+def _reference(
+    arguments: argparse.Namespace,
+    config: MappingConfig | None,
+    detector: Detector,
+    flat_field: FlatField | None,
+) -> Reference | None:
+    """Open the captures of --reference; None without them, or for a drawing. The part is cut out of
+    each as it is out of the capture, or out of each view."""
+    if arguments.reference is None or cli.is_mesh(arguments.reference):
+        return None
+
+    def opened(path: Path) -> tuple[Recording, Cloud]:
+        recording = _opened(arguments, [path])
+        return recording, _averaged(arguments, recording, flat_field)
+
+    settings = config or getattr(detector, "settings", None)
+    crop = getattr(settings, "crop", NoCrop())
+    return reference_of(arguments, opened, crop, cli.marks_of(arguments))
+
+
+def _part(arguments: argparse.Namespace, detector: Detector, cloud: Cloud) -> SeenPart:
+    """Find the part in the cloud that is judged."""
+    crop = getattr(getattr(detector, "settings", None), "crop", NoCrop())
+    return seen("this capture", cloud, crop, cli.marks_of(arguments))
+
+
+def _changes(
+    arguments: argparse.Namespace,
+    config: MappingConfig | None,
+    capture: _Captured,
+    detector: Detector,
+    result: Judged,
+) -> Changes | None:
+    """Return what changed since an earlier capture: that and this one are also judged by
+    themselves, for the sizes of damage then and now."""
+    reference = capture.reference
+    if reference is None or not reference.is_earlier:
+        return None
+    alone = argparse.Namespace(**vars(arguments))
+    alone.reference = None
+    alone.detector = detector.name
+
+    def judged_alone(loaded: tuple[Detector, dict[str, Any]], cloud: Cloud) -> Judged:
+        contender = candidate_of(alone, loaded, cloud, lambda _: (math.nan, ""))
+        return judged(contender.detector, cloud, contender.evidence, contender.threshold)
+
+    (now,) = _detectors_of(alone, config)
+    (then,) = cli.detectors_of(alone, alone.crop, _own_settings(alone))
+    return changes_of(
+        result,
+        reference.scan,
+        then=judged_alone(then, reference.parts[0].cloud),
+        now=judged_alone(now, replace(capture.cloud, expected=None)),
     )
 
 
@@ -220,11 +304,35 @@ def _chosen(
     candidates = [
         candidate_of(arguments, loaded, capture.cloud, silent_threshold) for loaded in detectors
     ]
+    if capture.reference is not None and arguments.threshold is None:
+        candidates = [
+            _with_left_out(arguments, capture.reference, candidate) for candidate in candidates
+        ]
     if arguments.detector != cli.DEFAULT_DETECTOR:
         return candidates[0]
     if arguments.threshold is not None:
         return noted(candidates[0], "as --threshold is in units of its score")
     return chosen(candidates, capture.cloud, cli.rate_text(arguments))
+
+
+def _with_left_out(
+    arguments: argparse.Namespace, reference: Reference, candidate: Contender
+) -> Contender:
+    """Raise a candidate's threshold if it has more findings on good parts than expected."""
+
+    def own(detector: Detector, cloud: Cloud) -> tuple[float, Evidence]:
+        evidence = analysed(detector, cloud)
+        threshold, _, searched = threshold_of(
+            arguments, detector, cloud, evidence, lambda: (math.nan, "")
+        )
+        return threshold, searched
+
+    calls = arguments.false_calls or cli.DEFAULT_FALSE_CALLS
+    check = checked_on_parts(reference, candidate.detector, own, calls)
+    if check is None:
+        return candidate
+    origin = f"{candidate.origin}; {check.text}"
+    return replace(candidate, threshold=candidate.threshold * check.factor, origin=origin)
 
 
 def _outline(choices: Sequence[Choice | None], mapped: Mapped | None) -> np.ndarray | None:
@@ -247,6 +355,27 @@ def _limit(
     return limit_of(detector, result, threshold, cli.limit_depth_m(arguments))
 
 
+def _decision(
+    candidate: Contender,
+    result: Judged,
+    tolerances: Sequence[Tolerance],
+    changes: Changes | None,
+) -> PartDecision | None:
+    """Return the decision on the tolerances, with what would have been missed at them; None without
+    tolerances."""
+    if not tolerances:
+        return None
+    depths_m = [tolerance.limit_mm * MM for tolerance in tolerances if tolerance.kind == "depth"]
+    depth_m = depths_m[0] if depths_m else None
+    missed = None
+    try:
+        missed = limit_of(candidate.detector, result, candidate.threshold, depth_m)
+        text = missed.text
+    except UserError as mistake:
+        text = f"what would have been missed is not known ({mistake.message})"
+    return part_decision(result, tolerances, missed, text, changes)
+
+
 def _with_pieces(evidence: Evidence, cloud: Cloud, choice: Choice | None) -> Evidence:
     """Note the pieces of the chosen part, and how much of each was judged."""
     if choice is None or choice.part is None:
@@ -264,10 +393,12 @@ def _detectors_of(
     out of each view, and settings of the map are not the detector's."""
     if config is None:
         return cli.detectors_of(arguments, arguments.crop, arguments.set)
-    own_settings = [
-        assignment for assignment in arguments.set if not assignment.startswith(cli.PREFIX)
-    ]
-    return cli.detectors_of(arguments, "none", own_settings)
+    return cli.detectors_of(arguments, "none", _own_settings(arguments))
+
+
+def _own_settings(arguments: argparse.Namespace) -> list[str]:
+    """Return the assignments of --set that are the detector's."""
+    return [assignment for assignment in arguments.set if not assignment.startswith(cli.PREFIX)]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -324,6 +455,8 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     """Print warnings (``further_warnings`` last), the verdict, the capture, the surface, the
     threshold, the classes and the strongest findings."""
     output.print_warnings((*warnings_of(run), *further_warnings))
+    if run.decision is not None:
+        print(run.decision.sentence)
     print(run.verdict.sentence)
     if run.mapped is None:
         _print_capture(run)
@@ -336,6 +469,8 @@ def print_inspection(run: Inspection, further_warnings: Sequence[str] = ()) -> N
     if run.result.missing is not None:
         print(run.result.missing.blind_text)
     print(f"threshold: {_threshold_text(run)}")
+    if run.changes is not None:
+        print(f"change: {run.changes.sentence}")
     if run.limit is not None:
         print(f"limit: {run.limit.text}")
     findings = run.result.findings
@@ -416,6 +551,9 @@ def write_inspection(
         files["view3d.html"] = lambda path: write_view3d(path, scene, title)
         for number, choice in enumerate(run.choices, start=1):
             files |= output.pictures(choice, f"targets-{number}.png")
+    if run.changes is not None:
+        changes_csv = run.changes.csv_text
+        files[outputs.CHANGE.name] = lambda path: path.write_text(changes_csv, encoding="utf-8")
     page = partial(_page_html, run, subject, scene, facts["provenance"], further_warnings)
     files[outputs.INSPECTION_PAGE.name] = lambda path: path.write_text(page(), encoding="utf-8")
     written = write_findings(
@@ -447,6 +585,8 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
         "settings": run.settings,
     }
     recordings = [*run.recordings, *run.quiet_recordings]
+    if run.reference is not None:
+        recordings += run.reference.recordings
     inputs = [path for recording in recordings for path in recording.files]
     for path in (arguments.poses, arguments.flat_field, *further_inputs):
         if path:
@@ -458,6 +598,8 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
         "threshold": {"k": run.threshold, "mm": threshold_mm, "from": run.threshold_origin},
         "verdict": run.verdict.facts,
         "limit": None if run.limit is None else run.limit.facts,
+        "change": None if run.changes is None else run.changes.facts,
+        "tolerance": None if run.decision is None else run.decision.facts,
         "warnings": evidence.warnings,
         "missing_returns": None if run.result.missing is None else run.result.missing.facts,
         "surface": {"one_unit_of_score_mm": scale_mm, **evidence.notes},
@@ -515,19 +657,26 @@ def _page_html(
 
     text = PageText(
         title=subject,
-        sentence=run.verdict.sentence,
+        sentence=_sentence(run),
         conditions=_conditions(run),
         warnings=(*warnings_of(run), *further_warnings),
         classes={name: CLASSES[name] for name in run.verdict.counts},
         flags=FLAGS,
-        summary=tuple(_summary_rows(run.verdict)),
+        summary=tuple(_summary_rows(run)),
         judged=tuple(_judged_rows(run)),
         facts=tuple(_fact_rows(run)),
-        limit=_limit_section(run.limit),
+        further=_sections(run),
         files=_files_text(run),
         provenance=provenance,
     )
     return inspection_html(run.result, scene, text)
+
+
+def _sentence(run: Inspection) -> str:
+    """Return the decision on the tolerances, if there are any, and the verdict."""
+    if run.decision is None:
+        return run.verdict.sentence
+    return f"{run.decision.short}. {run.verdict.sentence}"
 
 
 def _conditions(run: Inspection) -> str:
@@ -542,12 +691,17 @@ def _conditions(run: Inspection) -> str:
         distance_m = float(np.median(run.result.evidence.surface_z_m[is_judged]))
         parts.append(f"{distance_m:.2f} m away")
     parts.append(f"detector {run.detector.name} {run.detector.version}")
+    if run.reference is not None:
+        parts.append(f"compared with {run.reference.scan.name}")
     return ", ".join(parts)
 
 
-def _summary_rows(verdict: InspectionVerdict) -> list[tuple[str, str]]:
+def _summary_rows(run: Inspection) -> list[tuple[str, str]]:
     """Return the figures of the verdict."""
+    verdict = run.verdict
     rows = [(name, str(count)) for name, count in verdict.counts.items()]
+    if run.changes is not None:
+        rows += [(state, str(count)) for state, count in run.changes.counts.items()]
     extent = verdict.extent
     if np.isfinite(extent.judged_m2):
         rows.append(("judged", _area_text(extent.judged_m2)))
@@ -615,10 +769,33 @@ def _fact_rows(run: Inspection) -> list[tuple[str, str]]:
     return rows
 
 
-def _limit_section(limit: Limit | None) -> Markup:
-    """Return the section on sizes that would have been missed; empty if nobody asked."""
-    if limit is None:
-        return joined(())
+def _sections(run: Inspection) -> dict[str, Markup]:
+    """Return the sections that only some inspections have, by their headings."""
+    sections = {}
+    if run.decision is not None:
+        sections["Within tolerance?"] = decision_section(run.decision, _decision_rows(run))
+    if run.changes is not None:
+        sections["What changed"] = changes_section(run.changes)
+    if run.limit is not None:
+        sections["What would have been missed"] = _limit_section(run.limit)
+    return sections
+
+
+def _decision_rows(run: Inspection) -> list[tuple[str, str]]:
+    """Return part, reference, conditions and version of a decision."""
+    reference = "none: a smooth surface"
+    if run.arguments.reference is not None:
+        reference = str(run.arguments.reference)
+    return [
+        ("part", ", ".join(recording.name for recording in run.recordings)),
+        ("reference", reference),
+        ("conditions", _conditions(run)),
+        ("version", made_by(record(""))),
+    ]
+
+
+def _limit_section(limit: Limit) -> Markup:
+    """Return the section on sizes that would have been missed."""
     heads = ("width (mm)", "depth (mm)", "found", "95 % interval")
     rows = []
     for size in limit.sizes:
@@ -650,6 +827,8 @@ def _files_text(run: Inspection) -> dict[str, str]:
         shown.append(outputs.BLIND)
     if run.mapped is None and run.choices[0] is not None:
         shown.append(outputs.TARGETS)
+    if run.changes is not None:
+        shown.append(outputs.CHANGE)
     files = {shown_file.name: shown_file.note for shown_file in shown}
     if run.mapped is None:
         files[outputs.CLOUD.name] = outputs.CLOUD.note

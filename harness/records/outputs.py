@@ -61,6 +61,12 @@ TARGETS = Output(
 )
 BLIND = Output("blind.png", "the pixels without a return", "capture", "capture")
 GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
+CHANGE = Output(
+    "change.csv",
+    "distances from the earlier capture, with their level of detection",
+    "capture",
+    "capture",
+)
 CLOUD = Output("cloud.ply", "the cloud, with findings in magenta", "capture", "capture")
 FILES = (
     REPORT,
@@ -83,6 +89,7 @@ FILES = (
     TARGETS,
     BLIND,
     GAUGE_ROWS,
+    CHANGE,
     CLOUD,
 )
 JOURNAL = "journal"

@@ -46,6 +46,8 @@ MOST_NAMED = 3
 MOST_VALUES = 81
 """Most points of a line whose values are shown under the pointer."""
 
+MOST_HEADLINE_WORDS = 20
+
 # ---------------------------------------------------------------- the skeleton
 
 
@@ -67,6 +69,7 @@ def template(name: str, folder: Path = HERE) -> Template:
         style=Markup((HERE / "style.css").read_text(encoding="utf-8")),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),
         figure=figure,
+        split_answer=split_answer,
         warnings=(),
         figures={},
         closing="",
@@ -85,8 +88,8 @@ def page(
     under: Iterable[Markup] = (),
     warnings: Iterable[str] = (),
 ) -> str:
-    """Return a whole page: ``title``, ``warnings``, the ``answer`` in large letters, parts
-    ``under`` it, the body."""
+    """Return a whole page: ``title``, ``warnings``, the ``answer``, whose beginning is the
+    headline (`split_answer`), parts ``under`` it, the body."""
     return template("page.html").render(
         title=title,
         answer=answer,
@@ -94,6 +97,23 @@ def page(
         under=joined(under),
         warnings=list(warnings),
     )
+
+
+def split_answer(answer: str) -> tuple[str, str]:
+    """Return the headline of a page, as many sentences and clauses of the answer as have
+    `MOST_HEADLINE_WORDS`, but at least one, and the others."""
+    clauses = re.split(r"(?<=[.;]) ", answer)
+    count = 1
+    while (
+        count < len(clauses) and len(" ".join(clauses[: count + 1]).split()) <= MOST_HEADLINE_WORDS
+    ):
+        count += 1
+    headline = " ".join(clauses[:count])
+    further = " ".join(clauses[count:])
+    if headline.endswith(";"):
+        headline = f"{headline[:-1]}."
+        further = f"{further[0].upper()}{further[1:]}"
+    return headline, further
 
 
 # ---------------------------------------------------------------- elements
@@ -239,6 +259,29 @@ DAMAGE = "#ff00ff"
 """Magenta, the colour of damage in the clouds of the thesis."""
 COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
 """Colours of lines, in order."""
+HIT = "#005b96"
+MISS = "#b34700"
+GUIDE = "#cfd6dd"
+"""Colour of guides behind the data."""
+ON_IMAGE = "#10151b"
+"""Colour of lines and text on an image of residuals, whose colours are the same in the dark."""
+THEME = {
+    "#ffffff": "--page",
+    INK: "--ink",
+    GREY: "--grey",
+    PALE: "--line",
+    GUIDE: "--line",
+    HIT: "--yes",
+    MISS: "--no",
+    BLUE: "--blue",
+    ORANGE: "--orange",
+    GREEN: "--green",
+    RED: "--red",
+    SKY: "--sky",
+    PURPLE: "--purple",
+}
+"""The page's variables (`style.css`) that a figure's colours become, so that a figure follows a
+light or a dark page; `ON_IMAGE` and `DAMAGE` do not."""
 MARKERS = "osD^vP"
 """Markers of lines, in order."""
 STYLE: dict[str, Any] = {
@@ -285,11 +328,19 @@ def svg(name: str, size_in: tuple[float, float], alt: str, draw: Callable[[Figur
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{name}-", body)
+    body = _themed(body)
     for side in ("width", "height"):
         body = re.sub(rf'(<svg[^>]*?) {side}="[^"]*"', r"\1", body, count=1)
     values = json.dumps(_values(drawn), separators=(",", ":"), ensure_ascii=False)
     attributes = f'role="img" aria-label="{escape(alt)}" data-values="{escape(values)}"'
     return body.replace("<svg", f"<svg {attributes}", 1)
+
+
+def _themed(body: str) -> str:
+    """Return a figure whose colours of `THEME` are the page's; elsewhere they stay as drawn."""
+    for colour, variable in THEME.items():
+        body = body.replace(f": {colour.lower()}", f": var({variable}, {colour.lower()})")
+    return body
 
 
 def save_png(path: Path, size_in: tuple[float, float], draw: Callable[[Figure], None]) -> None:
@@ -309,8 +360,23 @@ def _save(
     with rc_context(style):
         figure = Figure(figsize=size_in, layout="constrained")
         draw(figure)
+        if options["format"] == "svg":
+            _lay_out(figure)
         figure.savefig(target, dpi=DPI, **options)
         return figure
+
+
+def _lay_out(figure: Figure) -> None:
+    """Lay out a figure for a file of SVG. Matplotlib itself would draw it once more for that: a
+    quarter of the time."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    FigureCanvasSVG(figure)
+    figure.set_dpi(POINTS_PER_INCH)
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def _values(figure: Figure) -> list[dict[str, Any]]:

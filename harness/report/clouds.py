@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from harness.records.examples import ExampleCloud, HoleInView, StudyExample, Where
-from harness.report.blocks import DAMAGE, INK, svg
+from harness.report.blocks import DAMAGE, HIT, MISS, ON_IMAGE, svg
 from harness.vocabulary.text import many
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ MOST_DOWN = 3
 """Most examples below one another."""
 SMALLEST_RING_PX = 2.5
 WIDTH_IN = 10.0
-HIT_COLOUR = "#005b96"
-MISS_COLOUR = "#b34700"
+SIGHT_IN = (3.7, 3.9)
+"""Width and height of the picture of one damage."""
 TITLES: dict[Where, str] = {
     "below": "Below the limit",
     "at": "At the limit",
@@ -102,12 +102,13 @@ def _ring(axes: Axes, hole: HoleInView, is_marked: bool) -> None:
     turn = np.linspace(0, 2 * np.pi, 65)
     u = hole.u_px + radius * np.cos(turn)
     v = hole.v_px + radius * np.sin(turn)
-    axes.plot(u, v, color=INK, lw=1.2, ls="-" if is_marked else (0, (2.5, 1.8)))
+    axes.plot(u, v, color=ON_IMAGE, lw=1.2, ls="-" if is_marked else (0, (2.5, 1.8)))
     above = (hole.u_px, hole.v_px - radius)
     axes.annotate(
         hole.hole,
         above,
         (0, 2.5),
+        color=ON_IMAGE,
         textcoords="offset points",
         ha="center",
         fontsize=9,
@@ -146,6 +147,21 @@ def examples_figure(
     return svg(name, size_in, f"{title}: {captions}.", draw)
 
 
+def sight_figure(name: str, examples: Sequence[StudyExample], title: str) -> str:
+    """Draw the example that is nearest to a set-up's limit: what the camera saw of damage that it
+    can just find."""
+    in_order = sorted(examples, key=lambda example: example.where != "at")
+    example = in_order[0]
+    norm = residual_norm(example.residual_mm)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        picture = _draw_example(axes, example, norm, TITLES)
+        residual_bar(figure, picture, "mm", ax=axes, shrink=0.8)
+
+    return svg(name, SIGHT_IN, f"{title}: {_caption(example, TITLES)}.", draw)
+
+
 def _column(examples: Sequence[StudyExample], where: Where) -> list[StudyExample]:
     """Return the first examples of a column, smallest first."""
     chosen = [example for example in examples if example.where == where]
@@ -173,7 +189,7 @@ def _draw_example(
     dot = 60 / max(height, width)
     picture = _image(axes, example.residual_mm, example.detected, norm, dot)
     rim_px = np.vstack([example.outline_px, example.outline_px[:1]])
-    axes.plot(rim_px[:, 0], rim_px[:, 1], color=INK, lw=1.3)
+    axes.plot(rim_px[:, 0], rim_px[:, 1], color=ON_IMAGE, lw=1.3)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), yticks=[])
     middle = (width - 1) / 2
     step = 10 / example.pitch_mm
@@ -183,7 +199,7 @@ def _draw_example(
     size = f"{example.diameter_mm:.1f} × {example.depth_mm:.3g} mm{pod}"
     axes.set_title(f"{titles[example.where]}\n{size}", fontsize=9.5)
     outcome = _outcome(example).replace(", threshold", "\nthreshold")
-    colour = HIT_COLOUR if example.hit else MISS_COLOUR
+    colour = HIT if example.hit else MISS
     axes.set_xlabel(outcome, color=colour, fontsize=9)
     return picture
 

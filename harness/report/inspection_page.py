@@ -64,8 +64,8 @@ class PageText:
     """What was judged and what not: name and value."""
     facts: tuple[tuple[str, str], ...]
     """How it was judged: name and value."""
-    limit: Markup
-    """The section on the sizes that would have been missed; empty if it was not asked for."""
+    further: Mapping[str, Markup]
+    """Further sections by their headings, in order."""
     files: Mapping[str, str]
     """Further files in the folder, with their content."""
     provenance: Mapping[str, Any]
@@ -99,7 +99,7 @@ def inspection_html(judged: Judged, scene: Scene3d, text: PageText) -> str:
         present_flags=present_flags(judged.findings),
         judged=definitions(text.judged),
         facts=definitions(text.facts),
-        limit=text.limit,
+        further=text.further,
         files=text.files,
         closing=fold(
             "Versions and command",

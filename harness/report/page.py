@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-GUIDE = "#cfd6dd"
-"""Colour of the 1/sqrt(N) guide."""
 TICKS_MM = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
@@ -185,7 +183,7 @@ def _draw_errors(axes: Axes, noise: pd.DataFrame) -> None:
     axes.plot(
         frames,
         noise["guide_mm"],
-        color=GUIDE,
+        color=blocks.GUIDE,
         lw=7,
         solid_capstyle="round",
         label="1/√N guide",

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.result import SetUpResult, StudyResult
 from harness.evaluation.study.surface import depth_varies
 from harness.records.examples import StudyExample
 from harness.records.schema import Table
 from harness.report.blocks import COLOURS, closing, joined, template
-from harness.report.clouds import examples_figure
+from harness.report.clouds import examples_figure, sight_figure
+from harness.report.limits_figure import MOST_ROWS, limits_figure
 from harness.report.scene import scene_svg
 from harness.report.study_figures import (
     MOST_CURVES,
@@ -29,6 +31,7 @@ from harness.tables.limits import (
     limit_notes,
     limits_grid,
     name_of,
+    short_names,
     study_answer,
 )
 from harness.tables.unknowns import (
@@ -50,6 +53,8 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
     notes = limit_notes(result.limits)
     if notes:
         parts += ["", *notes]
+    if result.record.designs:
+        parts += ["", *(design.sentence for design in result.record.designs)]
     sentences = unknown_sentences(result)
     if sentences:
         parts += ["", *sentences]
@@ -83,10 +88,16 @@ def study_html(
     shown = with_room(stated)
     answers = [unbroken(answer) for answer in _answers(result)]
     figures = {name: axis_figure(group, name) for name, group in groups.items()}
+    if any(set_up.limit.inspections for set_up in stated):
+        figures["limits"] = limits_figure([set_up.limit for set_up in stated])
     figures |= _curves(shown)
     figures |= _tornadoes(result)
-    pictures = _pictures(shown, list(examples))
+    drawn = list(examples)
+    pictures = _pictures(shown, drawn)
     figures |= {name: picture for name, (_, picture) in pictures.items()}
+    best = _best(stated, drawn)
+    if best is not None:
+        figures["sight"] = sight_figure("sight", _examples_of(best, drawn), name_of(best))
     warnings = [unbroken(text) for text in study.threshold_warnings(limits)]
 
     def table(declared: Table) -> Any:
@@ -105,7 +116,9 @@ def study_html(
         limit_notes=[unbroken(text) for text in limit_notes(limits)],
         set_ups=len(stated),
         most_curves=MOST_CURVES,
+        most_rows=MOST_ROWS,
         scene=scene_svg(result.facts),
+        best="" if best is None else short_names([best])[best.record.label],
         unknowns=_unknown_parts(result),
         axes=[_axis_part(name, group) for name, group in groups.items()],
         has_depths=any(
@@ -150,18 +163,28 @@ def _pictures(
     """Return the heading and the figure of each set-up's examples by the figure's name."""
     pictures: dict[str, tuple[str, str]] = {}
     for set_up in shown:
-        record = set_up.limit.record
-        of_set_up = [
-            example
-            for example in examples
-            if (example.variant, example.frames) == (record.variant, record.frames)
-        ]
+        of_set_up = _examples_of(set_up.limit, examples)
         if of_set_up:
             name = f"examples-{len(pictures) + 1}"
             head = name_of(set_up.limit)
             by_limit = is_within_sizes(set_up.limit)
             pictures[name] = (head, examples_figure(name, of_set_up, head, by_limit=by_limit))
     return pictures
+
+
+def _examples_of(limit: SetUpLimit, examples: Sequence[StudyExample]) -> list[StudyExample]:
+    record = limit.record
+    return [
+        example
+        for example in examples
+        if (example.variant, example.frames) == (record.variant, record.frames)
+    ]
+
+
+def _best(set_ups: Sequence[SetUpResult], examples: Sequence[StudyExample]) -> SetUpLimit | None:
+    """Return the smallest limit of the set-ups with examples; None if there is none."""
+    limits = [set_up.limit for set_up in set_ups if _examples_of(set_up.limit, examples)]
+    return min(limits, key=lambda limit: limit.a90_95.value, default=None)
 
 
 def _tornadoes(result: StudyResult) -> dict[str, str]:

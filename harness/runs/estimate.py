@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from harness.experiment.schema import CaptureSource, Experiment
+from harness.runs.bill import expected
 from harness.runs.jobs import Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
@@ -109,12 +110,18 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     stored_records = len(Journal(folder / "journal"))
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {points}, {many(len(plan.groups), 'set')} of frames")
-    print(f"  renders: {len(renders)}, {sum(path.exists() for path in renders)} of them cached")
-    print(f"  trials: {trials}")
+    study = experiment.config.study
+    most = " at most" if study is not None and study.precision is not None else ""
+    cached = sum(path.exists() for path in renders)
+    print(f"  renders: {len(renders)}{most}, {cached} of them cached")
+    print(f"  trials: {trials}{most}")
     if stored_records:
         print(
             f"  the journal holds {many(stored_records, 'trial')}; those of the same code "
             "and settings are not run again"
         )
+    cost = expected(Path(out), name, len(renders), trials)
+    if cost:
+        print(f"  {cost}")
     print(f"  results would go to {folder}")
     return 0

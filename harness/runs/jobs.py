@@ -46,7 +46,8 @@ class Job:
 class Ended:
     """The end of a job. ``value``: its result; of a trial, its record as text. ``why``: a user's
     mistake, or the end of a bug's traceback. ``peak_mb``: peak resident memory, 0 if unknown.
-    ``ends_all``: the disk is full."""
+    ``ends_all``: the disk is full. ``processor_s``: processor time that another process spent on
+    it."""
 
     state: State
     value: Any = None
@@ -56,6 +57,7 @@ class Ended:
     peak_mb: float = 0.0
     worker: str = ""
     ends_all: bool = False
+    processor_s: float = 0.0
 
     @cached_property
     def record(self) -> dict[str, Any] | None:
@@ -127,6 +129,16 @@ class Outcome:
     renders: StageCounts = field(default_factory=StageCounts)
     trials: StageCounts = field(default_factory=StageCounts)
     peak_mb: float = 0.0
+
+    def counted_after(self, earlier: Outcome) -> Outcome:
+        """Return this outcome; what the same command did in an earlier batch counts as done, not
+        as found."""
+        for counts, before in ((self.renders, earlier.renders), (self.trials, earlier.trials)):
+            counts.done += before.done
+            counts.found -= before.done
+            counts.seconds += before.seconds
+        self.peak_mb = max(self.peak_mb, earlier.peak_mb)
+        return self
 
 
 @dataclass(frozen=True)

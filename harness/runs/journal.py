@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +25,8 @@ from harness.vocabulary.seeds import canonical_json
 JOURNAL_VERSION = 8
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
+DESIGNS = "design-"  # prefix of the keys of entries that hold the boards of a study's next batch
+NOT_TRIALS = (THRESHOLDS, DESIGNS)
 NOTHING = "null"  # replaces the record of a trial that is not done
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 
@@ -53,7 +55,7 @@ class Journal:
         self._is_read = False
 
     def __len__(self) -> int:
-        return sum(not key.startswith(THRESHOLDS) for key in self._known())
+        return sum(not key.startswith(NOT_TRIALS) for key in self._known())
 
     def thresholds(self) -> list[str]:
         """Return the keys of the stored thresholds, sorted."""
@@ -77,8 +79,21 @@ class Journal:
             return None
         return record[1] if record is not None and record[0] == key else None
 
+    def records(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Yield the records of finished trials, read one by one to save memory. Raises UserError
+        if one is gone."""
+        for key in keys:
+            entry = self.read(key)
+            if entry is None or entry.record is None:
+                raise UserError(
+                    f"{self.folder}: the record {key} is gone or damaged since it was written",
+                    fix="run the same command again: what is missing is run again",
+                )
+            yield entry.record
+
     def entries(self) -> Iterator[tuple[str, Ended]]:
-        """Yield (key, entry) of all trials and thresholds, in the order of the segments."""
+        """Yield (key, entry) of all trials, thresholds and designs, in the order of the
+        segments."""
         for key, _ in sorted(self._known().items(), key=lambda item: item[1][:2]):
             if (entry := self.read(key)) is not None:
                 yield key, entry

@@ -20,8 +20,8 @@ from harness.records.examples import (
     Where,
 )
 from harness.runs.plan import Batch, Group, SweepPlan
-from harness.trials.averages import averages_of
-from harness.trials.board import Board, load_board
+from harness.trials.averages import Averaging, averages_of
+from harness.trials.board import Board, LabelledCloud, load_board
 from harness.trials.clouds import MapClouds, TrialPoint, mapping_of
 from harness.trials.judge import Judgement, judge
 from harness.trials.trial import Trial, capture_of, clouds_of
@@ -45,15 +45,12 @@ def pictures_of(
     return _map_examples(group, thresholds)
 
 
-def _judged_again(trial: Trial, point: TrialPoint, most: int) -> Judgement:
-    """Judge the cloud of one view like a trial that drew ``most`` frames."""
+def _seen_again(trial: Trial, point: TrialPoint, most: int) -> LabelledCloud:
+    """Return the cloud of one view like a trial that drew ``most`` frames."""
     board = load_board(trial.views[0])
     capture = capture_of(trial, 0, board, most)
-    averaging = point.averaging
-    clouds = averages_of(
-        capture, [point.frames], averaging.config, averaging.exact, averaging.flat_field
-    )
-    return judge(board.labelled(clouds[point.frames]), point.criteria)
+    clouds = averages_of(capture, [point.frames], point.averaging)
+    return board.labelled(clouds[point.frames])
 
 
 def _detected(judgement: Judgement) -> np.ndarray:
@@ -73,8 +70,12 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
     board = load_board(batch.views[0])
     holes = tuple(_hole_in_view(board, damage) for damage in board.truth)
     examples = []
+    seen: dict[tuple[Averaging, int], LabelledCloud] = {}
     for point in _fewest_and_most_frames(trial.points):
-        judgement = _judged_again(trial, point, most)
+        seen_as = (point.averaging, point.frames)
+        if seen_as not in seen:
+            seen[seen_as] = _seen_again(trial, point, most)
+        judgement = judge(seen[seen_as], point.criteria)
         example = ExampleCloud(
             frames=point.frames,
             variant=point.variant,
@@ -154,9 +155,7 @@ def _map_examples(group: Group, thresholds: Mapping[str, float]) -> list[MappedE
     averages = []
     for number, board in enumerate(boards):
         capture = capture_of(trial, number, board, most)
-        averages.append(
-            averages_of(capture, [most], averaging.config, averaging.exact, averaging.flat_field)
-        )
+        averages.append(averages_of(capture, [most], averaging))
     maps = clouds_of(trial, boards, averages)
     assert isinstance(maps, MapClouds)  # the group has several views
     examples = []
@@ -343,7 +342,7 @@ def _study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> Study
     )
     point = next(point for point in trial.points if point.digest == shown.point.digest)
     board = load_board(trial.views[0])
-    judgement = _judged_again(trial, point, point.frames)
+    judgement = judge(_seen_again(trial, point, point.frames), point.criteria)
     hole = str(inspected.hole[row])
     damage = next(damage for damage in board.truth if str(damage.id) == hole)
     rim_px = _outline_px(board, damage)

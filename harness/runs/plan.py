@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import cycle
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 from detectors import DETECTORS
 from detectors.interface import Calibratable
+from harness.evaluation.study.record import BoardDesign
 from harness.experiment.schema import Experiment, Point, SimulatedSource, StudyConfig
 from harness.experiment.unfold import source_of
 from harness.records.rows import Role
@@ -284,9 +285,7 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
         digest=point.digest,
         variant=point.variant,
         frames=config.capture.frames,
-        averaging=Averaging(
-            config.capture.average, config.capture.exact, config.capture.flat_field
-        ),
+        averaging=Averaging(config.capture.average, config.capture.flat_field),
         criteria=Criteria(
             detector=config.detector.name,
             settings_json=canonical_json(config.detector.settings),
@@ -299,12 +298,33 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
     )
 
 
+Designs = Mapping[str, BoardDesign]
+"""The damaged boards of a study with a precision, by `family_of` its points."""
+
+
+def family_of(point: Point) -> str:
+    """Return what names the points of a study whose damaged boards have the same sizes: their
+    damage and the seed of the boards."""
+    target = point.config.simulated.target
+    assert isinstance(target, DrawnTargetConfig)
+    return digest([target.damage.to_data(), target.seed])
+
+
 @dataclass(frozen=True)
 class SweepPlan:
     """All groups of an experiment."""
 
     groups: tuple[Group, ...]
     """Leaders stand before the groups that they lead."""
+    designs: Designs = field(default_factory=dict)
+    """The damaged boards so far of a study with a precision, else empty."""
+
+    def group_of(self, point: Point) -> Group:
+        """Return the group of one of the experiment's points."""
+        for group in self.groups:
+            if any(member.digest == point.digest for member in group.points):
+                return group
+        raise KeyError(point.label)
 
     @property
     def renders(self) -> tuple[RenderJob, ...]:
@@ -316,15 +336,22 @@ class SweepPlan:
         return tuple(jobs.values())
 
 
-def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> SweepPlan:
+def plan_of(
+    experiment: Experiment,
+    cache: Path,
+    folder: Path | None = None,
+    designs: Designs | None = None,
+) -> SweepPlan:
     """Group the points of an experiment that share their frames. ``folder``: its results; None:
-    the cache."""
+    the cache. ``designs``: the damaged boards so far of a study with a precision; without them a
+    study has all boards that it declares, with sizes over the whole range."""
     by_frames: dict[str, list[Point]] = {}
     for point in experiment.points:
         by_frames.setdefault(point.frames_key, []).append(point)
     by_first_trials: dict[str, list[Group]] = {}
     for points in by_frames.values():
-        group = _group(tuple(points), cache, folder or cache)
+        design = designs[family_of(points[0])] if designs else None
+        group = _group(tuple(points), cache, folder or cache, design)
         by_first_trials.setdefault(_before_thresholds(group), []).append(group)
     groups: list[Group] = []
     for leader, *followers in by_first_trials.values():
@@ -332,7 +359,7 @@ def plan_of(experiment: Experiment, cache: Path, folder: Path | None = None) -> 
         leader = replace(leader, also=also)
         groups.append(leader)
         groups += [replace(group, learning=(), first=(), leader=leader) for group in followers]
-    return SweepPlan(tuple(groups))
+    return SweepPlan(tuple(groups), designs or {})
 
 
 def _before_thresholds(group: Group) -> str:
@@ -351,18 +378,22 @@ def _before_thresholds(group: Group) -> str:
     return repr([group.seed, group.poses, judged_as, shown])
 
 
-def _group(points: tuple[Point, ...], cache: Path, folder: Path) -> Group:
+def _group(
+    points: tuple[Point, ...], cache: Path, folder: Path, design: BoardDesign | None
+) -> Group:
     """Return the group of points that share their frames. Raises UserError for a target without
     damage."""
     config = points[0].config
     source = config.simulated
     if config.study is not None and isinstance(source.target, DrawnTargetConfig):
-        boards = _StudyBoards(points[0], config.study, cache)
+        boards = _StudyBoards(points[0], config.study, cache, design)
         calibrate = config.threshold.calibrate
         calibrating = 0 if calibrate is None else calibrate.boards or 0
         learning = boards.batches("learning", LEARNING_BOARDS)
         first = boards.batches("calibration", calibrating)
-        damaged = boards.batches("damaged", config.study.boards)
+        damaged = boards.batches(
+            "damaged", config.study.boards if design is None else design.boards
+        )
         then = damaged + boards.batches("hole_free", config.study.hole_free_boards)
     else:
         target = source.target.declare()
@@ -408,6 +439,8 @@ class _StudyBoards:
     """The number of units of the camera."""
     cache: Path
     """The cache of renders."""
+    design: BoardDesign | None
+    """Sizes of the damaged boards; None: drawn over the whole range."""
 
     def batches(self, role: Role, count: int) -> list[Batch]:
         """Return the batches of a role's first ``count`` boards."""
@@ -415,15 +448,19 @@ class _StudyBoards:
         for board in range(count):
             source = source_of(self.point, role, board)
             assert isinstance(source.target, DrawnTargetConfig)
-            target = _drawn(source.target, role, board)
+            chosen_mm = None
+            if self.design is not None and role == "damaged":
+                chosen_mm = self.design.sizes_mm(board)
+            target = _drawn(source.target, role, board, chosen_mm)
             units = self._units(source.camera, role, board)
             batches.append(batch_of(target, role, source, self.cache, board, units))
         return batches
 
     def _units(self, camera: CameraConfig, role: Role, board: int) -> tuple[CameraConfig, ...]:
         """Return the units of the camera that inspect a board: all of the study's for a damaged
-        board, one of its own for any other; none if the study does not draw units."""
-        if not self.study.units:
+        board, one of its own for any other; none if the camera's own unit does."""
+        calibrates = role in ("learning", "calibration")
+        if not self.study.units or (calibrates and self.study.one_unit_calibrates):
             return ()
         numbers = range(self.study.units) if role == "damaged" else [board]
         seed = self.point.config.seed

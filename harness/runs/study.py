@@ -4,7 +4,6 @@ import datetime
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,14 +20,16 @@ from harness.report.page import write_report
 from harness.report.sections import final_tables
 from harness.report.study_page import study_html, study_parts
 from harness.report.summaries import as_files, summaries
+from harness.runs.bill import BILL, Bill, Metered
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import pictures_from, render_missing, values_of
-from harness.runs.jobs import STATES, Job, JobEngine, Outcome
+from harness.runs.jobs import STATES, Job, Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
 from harness.runs.pictures import shown_in, study_examples
-from harness.runs.plan import SweepPlan, plan_of
+from harness.runs.plan import SweepPlan
+from harness.runs.precision import Batches, refuse_shard
 from harness.runs.results_folder import point_to
 from harness.runs.run import run_plan
 from harness.runs.shards import Shard, locked
@@ -58,6 +59,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     """Run an experiment, write tables and report, print a summary; of a shard only the journal.
     Returns 0, 1, 130."""
     began = time.monotonic()
+    bill = Bill()
+    bill.begin("plan")
     # recorded now: a commit during the sweep does not change the code that runs
     origin = record(command)
     origin["digests"] = experiment_digests(experiment)
@@ -65,33 +68,41 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     folder = experiment.folder(out)
     cache = out / ".cache" / "renders"
     _refuse_newer(folder)
+    refuse_shard(experiment, options.shard)
     detectors = {point.config.detector.name for point in experiment.points}
     try:
+        journal = Journal(folder / "journal")
         # absolute paths: other processes may have started in another folder
-        plan = plan_of(experiment, cache.absolute(), folder.absolute())
+        batches = Batches(experiment, journal, cache.absolute(), folder.absolute())
+        plan = batches.first()
         # the first file written shows whether the folder is writable, before any work
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
-        journal = Journal(folder / "journal")
         with (
             in_use(cache),
             locked(folder, options.shard),
-            engine_of(options, detectors, cache) as engine,
+            Metered(engine_of(options, detectors, cache), bill) as engine,
         ):
+            bill.begin("detection")
             with progress_display() as report:
-                outcome = run_plan(
-                    plan,
-                    journal,
-                    engine,
-                    report,
+                run = partial(
+                    run_plan,
+                    journal=journal,
+                    engine=engine,
+                    report=report,
                     shard=options.shard,
                     retry_failed=options.retry_failed,
                 )
+                outcome = run(plan)
+                while following := batches.after(plan, outcome, engine):
+                    plan = following
+                    outcome = run(plan).counted_after(outcome)
             if not options.shard.is_whole:
                 return _shard_over(options.shard, outcome, folder)
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
             print("writing tables and report", file=sys.stderr)
-            tables = tables_of(_records(journal, outcome), experiment)
+            bill.begin("tables and page")
+            tables = tables_of(journal.records(outcome.finished), experiment)
             provenance = _provenance(experiment, plan, outcome, tables, origin)
             provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
             write_tables(folder, tables.stored(), provenance)
@@ -99,6 +110,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 shown = _write_report(folder, experiment, outcome, tables, provenance)
             else:
                 shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
+            bill.divide_trials(_frames_share(tables))
+            provenance[BILL] = bill.rounded()
             write_json(folder / PROVENANCE.name, provenance)
         if options.cache_limit_gb is not None:
             limit_bytes = round(options.cache_limit_gb * 1e9)
@@ -110,6 +123,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     point_to(folder)
     show([*(f"warning: {text}" for text in provenance["warnings"]), *shown])
     _print_failures(outcome)
+    print(bill.in_words(), file=sys.stderr)
     print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
 
@@ -137,20 +151,6 @@ def _refuse_newer(folder: Path) -> None:
         check_version(version, RESULTS_VERSION, folder / PROVENANCE.name, "a result folder")
 
 
-def _records(journal: Journal, outcome: Outcome) -> Iterator[dict[str, Any]]:
-    """Yield the records of all finished trials in the order of their keys; reading them one by one
-    saves memory."""
-    for key in outcome.finished:
-        entry = journal.read(key)
-        if entry is None or entry.record is None:
-            fix = "run the same command again: what is missing is run again"
-            raise UserError(
-                f"{journal.folder}: the record {key} is gone or damaged since it was written",
-                fix=fix,
-            )
-        yield entry.record
-
-
 def _write_study(
     folder: Path,
     experiment: Experiment,
@@ -158,7 +158,7 @@ def _write_study(
     outcome: Outcome,
     tables: ResultTables,
     provenance: dict[str, Any],
-    engine: JobEngine,
+    engine: Metered,
 ) -> list[str | Grid]:
     """Write a study's record, tables and report. Return what the terminal shows."""
     failed = failures_by_point(plan, outcome.failures, outcome.thresholds)
@@ -168,9 +168,11 @@ def _write_study(
         raise UserError(f"no damaged board of {name} was judged: {_reasons(outcome)}")
     provenance["warnings"] += without_limit(experiment.points, outcome, failed, study.set_ups)
     write_text(folder / STUDY.name, record_text(study))
+    engine.bill.begin("statistics")
     result = evaluate_study(
         study, tables, experiment.data, each_of=partial(values_of, engine=engine)
     )
+    engine.bill.begin("tables and page")
     shown = list(shown_in(plan, result.limits))
     # trials that ran on other machines may have no views here
     views = [job for damages in shown for damage in damages for job in damage.batch.renders]
@@ -272,6 +274,13 @@ def _print_failures(outcome: Outcome) -> None:
     else:
         again = "the same command, with --retry-failed, runs them again"
     print(f"{totals}: {_reasons(outcome)}\n{again}", file=sys.stderr)
+
+
+def _frames_share(tables: ResultTables) -> float:
+    """Return the frames' share of the time of trials."""
+    frames_s = float(tables.runs["seconds_frames"].sum())
+    detect_s = float(tables.runs["seconds_detect"].sum())
+    return frames_s / max(frames_s + detect_s, 1e-9)
 
 
 def _provenance(

@@ -44,11 +44,10 @@ def record_of(
 
     ``failed``: failed trials by point digest."""
     calibrate = experiment.config.threshold.calibrate
-    groups = {point.digest: group for group in plan.groups for point in group.points}
     set_ups = []
     for point in experiment.points:
         failed_count = len(failed.get(point.digest, ()))
-        set_up = _set_up(point, groups[point.digest], tables, failed_count)
+        set_up = set_up_record(point, plan, tables, failed_count)
         if set_up is not None:
             set_ups.append(set_up)
     return StudyRecord(
@@ -59,14 +58,16 @@ def record_of(
         false_calls_per_m2=None if calibrate is None else calibrate.false_calls_per_m2,
         provenance={key: provenance[key] for key in RECORDED_PROVENANCE},
         set_ups=tuple(set_ups),
+        designs=tuple(plan.designs.values()),
     )
 
 
-def _set_up(
-    point: Point, group: Group, tables: ResultTables, failed_count: int
+def set_up_record(
+    point: Point, plan: SweepPlan, tables: ResultTables, failed_count: int
 ) -> SetUpRecord | None:
     """Return the record of a point; None if no damaged board of it was judged."""
     config = point.config
+    group = plan.group_of(point)
     holes = _rows_of(point, tables.holes)
     runs = _rows_of(point, tables.runs)
     if holes.empty:
@@ -103,6 +104,7 @@ def _set_up(
         units=units,
         calibrated=_calibrated(calibrating),
         threshold_error=_threshold_error(calibrating, config),
+        sizes_chosen=bool(plan.designs),
         drawn=tuple(_drawn(unknown, point, group) for unknown in point.unknowns),
     )
 

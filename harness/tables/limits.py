@@ -20,6 +20,9 @@ from harness.vocabulary.text import Grid
 
 MOST_ANSWERS = 3
 ONE_UNIT = "One unit of the camera"
+FOUND = "Nine in ten found"
+SIZES = re.compile("(diameter|depth|width|length) ")
+"""Begins the part of a set-up's label that states a range of sizes."""
 NOT_DEMONSTRATED = "not demonstrated"
 BEYOND = "lies beyond the largest size inspected"
 """Words of a statement's note on an extrapolated bound, which `notes_of` replaces by a sentence of
@@ -338,7 +341,9 @@ def study_answer(limits: Sequence[SetUpLimit]) -> str:
     answer = _answer(limits)
     if any(limit.over_units for limit in limits):
         return answer
-    if answer.startswith(("Found ", "None ")):
+    if answer.startswith(FOUND):
+        return answer.replace(FOUND, f"{FOUND} by one unit", 1)
+    if answer.startswith("None "):
         answer = answer[0].lower() + answer[1:]
     return f"{ONE_UNIT}: {answer}"
 
@@ -353,13 +358,16 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
         none = f"None of {count} set-ups demonstrates a limit (a90/95) within the sizes inspected"
         return f"{none}{_sizes(*limits)}."
     within.sort(key=lambda limit: quoted(limit).value)
+    names = short_names(limits)
     kinds = sorted({limit.record.inspected.limit_of for limit in within}, reverse=True)
     spans = []
     for kind in kinds:  # a depth is not compared with a diameter
         of_kind = [limit for limit in within if limit.record.inspected.limit_of == kind]
         prefix = f"a {kind} of " if len(kinds) > 1 else ""
-        spans.append(f"{prefix}{_size_and_label(of_kind[0])} to {_size_and_label(of_kind[-1])}")
-    answer = f"Found nine times out of ten (a90/95): {'; '.join(spans)}"
+        smallest = _size_and_name(of_kind[0], names)
+        largest = _size_and_name(of_kind[-1], names)
+        spans.append(f"{prefix}{smallest} to {largest}")
+    answer = f"{FOUND} (a90/95): {'; '.join(spans)}"
     without = count - len(within)
     if not without:
         return f"{answer}."
@@ -367,8 +375,21 @@ def _answer(limits: Sequence[SetUpLimit]) -> str:
     return f"{answer}; {without} of {count} set-ups {verb} no limit within the sizes inspected."
 
 
-def _size_and_label(limit: SetUpLimit) -> str:
-    return f"{text.size(quoted(limit).value)} mm ({limit.record.label})"
+def _size_and_name(limit: SetUpLimit, names: dict[str, str]) -> str:
+    return f"{text.size(quoted(limit).value)} mm ({names[limit.record.label]})"
+
+
+def short_names(limits: Sequence[SetUpLimit]) -> dict[str, str]:
+    """Return the set-ups' labels without the ranges of their sizes, by label; whole labels if two
+    set-ups differ in these only."""
+    names = {}
+    for limit in limits:
+        label = limit.record.label
+        parts = [part for part in label.split(", ") if not SIZES.match(part)]
+        names[label] = ", ".join(parts)
+    if len(set(names.values())) < len(names):
+        return {label: label for label in names}
+    return names
 
 
 def limit_sentence(limit: SetUpLimit, *, again: bool = False) -> str:

@@ -115,11 +115,8 @@ def captured(
         counts = sorted({point.frames for point in points if uses_view(point, number)})
         clouds: dict[int, Cloud] = {}
         if counts:
-            averaging = points[0].averaging
             capture = capture_of(trial, number, board, counts[-1])
-            clouds = averages_of(
-                capture, counts, averaging.config, averaging.exact, averaging.flat_field
-            )
+            clouds = averages_of(capture, counts, points[0].averaging)
         averages.append(clouds)
     return clouds_of(trial, boards, averages)
 

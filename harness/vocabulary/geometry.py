@@ -10,7 +10,7 @@ camera, origin at the centre, metres. ``T_a_b`` maps co-ordinates in b to co-ord
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -293,6 +293,24 @@ class MapViews:
     pixel_m: tuple[float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class ExpectedSurface:
+    """The surface that a reference (an earlier capture, good parts, a drawing) says a cloud shows,
+    along its own rays. The functions take points (n, 3) of the cloud's frame, metres, and return
+    (n,), NaN where the reference shows nothing."""
+
+    text: str
+    """The reference and how well it fits, in words."""
+    z_at: Callable[[np.ndarray], np.ndarray]
+    """z at which the points' rays meet the reference, metres."""
+    spread_at: Callable[[np.ndarray], np.ndarray]
+    """Standard deviation of that z: noise of the reference, and how parts differ there, metres."""
+    registration_at: Callable[[np.ndarray], np.ndarray]
+    """Standard deviation of that z by the placement, which neighbours share, metres."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Plain data on the placement."""
+
+
 @dataclass(frozen=True)
 class Cloud:
     """The average of frames as points in the camera's frame: the input of a detector. ``points_m``
@@ -308,7 +326,7 @@ class Cloud:
     are the sides, along rows and along columns, of the rectangle in r x c equal parts of the grid;
     None means that they are not known to differ. ``edge_reach_px`` is how far the camera's beam and
     filters mix what lies beyond an edge into the pixels inside, as its model states; 0 means
-    unknown."""
+    unknown. ``expected`` is what a reference says that it should show, if there is one."""
 
     points_m: np.ndarray
     reason: np.ndarray
@@ -328,6 +346,7 @@ class Cloud:
     noise_reach_px: float = 0.0
     noise_sides_px: np.ndarray | None = None
     edge_reach_px: float = 0.0
+    expected: ExpectedSurface | None = None
 
     @cached_property
     def crops(self) -> dict[Any, Any]:

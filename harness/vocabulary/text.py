@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
 UNKNOWN_TEXT = "–"
+EQUAL_CONTRAST = 0.179
+"""Relative luminance of a ground on which black and white text have equal contrast, 4.6: the root
+of 0.05 * 1.05, less 0.05."""
 INCHES = {n: str(Fraction(n, 16)) for n in (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)}
 
 
@@ -238,7 +241,8 @@ def _data_cell(cell: Cell, is_number: bool) -> Markup:
         red = round(255 + (0 - 255) * weight)
         green = round(255 + (94 - 255) * weight)
         blue = round(255 + (156 - 255) * weight)
-        ink = "#fff" if cell.share > 0.72 else "#1d2530"
+        is_dark = _luminance(red, green, blue) < EQUAL_CONTRAST
+        ink = "#fff" if is_dark else "#000"
         style = Markup(' style="background:rgb({},{},{});color:{}"').format(red, green, blue, ink)
     kinds = (
         "n" if is_number else "",
@@ -248,6 +252,15 @@ def _data_cell(cell: Cell, is_number: bool) -> Markup:
     kind = " ".join(filter(None, kinds))
     class_attribute = Markup(' class="{}"').format(kind) if kind else Markup("")
     return Markup("<td{}{}>{}{}</td>").format(class_attribute, style, escape(large), below)
+
+
+def _luminance(red: int, green: int, blue: int) -> float:
+    """Return the relative luminance of a colour (0 to 255), from 0 to 1 (WCAG 2.2)."""
+    linear = []
+    for channel in (red, green, blue):
+        value = channel / 255
+        linear.append(value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4)
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def text_of(parts: Iterable[str | Grid]) -> str:

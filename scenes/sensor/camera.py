@@ -159,7 +159,8 @@ def numbers_of_lens(lens: Lens) -> dict[str, Any]:
     }
 
 
-@lru_cache
+# a study that draws unknown numbers has a camera for each board
+@lru_cache(maxsize=4096)
 def _with_numbers(name: str, numbers_json: str) -> AnyCamera:
     data = load_camera(name).to_data()
     for path, value in json.loads(numbers_json).items():

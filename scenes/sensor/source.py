@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -13,14 +13,18 @@ import numpy as np
 from harness.vocabulary.geometry import Frame, Region
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import NoiseFreeView
-from scenes.sensor.amcw.at_once import AtOnce, at_once
 from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.first_order import FirstOrder, first_order
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.camera import AnyCamera
 from scenes.sensor.common.config import CameraConfig
-from scenes.sensor.common.unit import FrameTotals, frame_errors_m
+from scenes.sensor.common.unit import DecodedFrame, frame_errors_m
 from scenes.sensor.empirical.imager import EmpiricalImager
 from scenes.sensor.lidar.scanner import LidarScanner
+
+WHOLE_FRAMES = 2
+"""First frames of a capture that go through the whole chain, although the first-order model holds:
+sorting a view's pixels costs as much as ten frames, and many captures have only one or two."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,14 @@ class SimulatedUnit:
         return float(self.camera.unit.jitter_mm.value)
 
     @cached_property
-    def at_once(self) -> AtOnce | None:
-        """Sums of frames of this view without drawing each; None if frames must be drawn, or for
-        other kinds."""
+    def first_order(self) -> FirstOrder | None:
+        """The first-order model of this view; None if whole frames cost less, or for other
+        kinds."""
         if not isinstance(self.model, AmcwImager):
             return None
         wanted = np.zeros(self.view.range_m.shape, bool)
         wanted[self.cut] = True
-        return at_once(self.model, self.exposure, wanted)
+        return first_order(self.model, self.exposure, wanted)
 
     @cached_property
     def region(self) -> Region:
@@ -148,29 +152,12 @@ class SimulatedCapture:
         )
         return np.array(list(islice(errors_m, self.n_frames)))
 
-    def totals(self, parts: Sequence[np.ndarray]) -> list[FrameTotals] | None:
-        """Return the sums over the frames of the first of ``parts``, of the first two, and so on,
-        drawn at once: their distribution is that of `frames`. Each part has numbers of frames
-        (t,). None if frames must be drawn."""
-        summer = self.unit.at_once
-        if summer is None:
-            return None
-        errors_m = self.errors_m
-        largest_error_m = np.abs(errors_m[np.concatenate(parts)]).max(initial=0.0)
-        if largest_error_m > summer.farthest_error_m:
-            return None
-
-        def stream(block: int) -> np.random.Generator:
-            return random_stream(self.seed, "frames at once", block, *self.labels)
-
-        return [sums.cut(self.unit.cut) for sums in summer.totals(parts, errors_m, stream)]
-
     def frames(self) -> Iterator[Frame]:
         """Yield the frames; each call repeats the same noise."""
         rng = random_stream(self.seed, "frames", *self.labels)
         cut = self.unit.cut
         for number in range(self.n_frames):
-            decoded = self.unit.model.frame(self.unit.exposure, rng, self.errors_m[number])
+            decoded = self._drawn(number, rng)
             yield Frame(
                 f"frame {number}",
                 decoded.z_m[cut],
@@ -178,3 +165,12 @@ class SimulatedCapture:
                 rgb=self.unit.rgb,
                 amplitude=decoded.amplitude[cut],
             )
+
+    def _drawn(self, number: int, rng: np.random.Generator) -> DecodedFrame:
+        """Draw the frame of a number on the view's region, by the cheaper model that holds."""
+        unit = self.unit
+        error_m = float(self.errors_m[number])
+        model = unit.first_order if number >= WHOLE_FRAMES else None
+        if model is None or abs(error_m) > model.farthest_error_m:
+            return unit.model.frame(unit.exposure, rng, error_m)
+        return model.frame(rng, error_m)

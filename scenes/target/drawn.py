@@ -89,6 +89,22 @@ class _Drawn(Config):
         return getattr(self, "depth_mm", None)
 
     @property
+    def limit_of(self) -> str:
+        """The name of the size that a limit is of: ``size_of``, or depth if only depths vary."""
+        low_mm, high_mm = self.size_mm
+        shallowest_mm, deepest_mm = self.depths_mm or (0.0, 0.0)
+        if low_mm == high_mm and shallowest_mm < deepest_mm:
+            return "depth"
+        return self.size_of
+
+    @property
+    def limit_range_mm(self) -> tuple[float, float]:
+        """Ends of the size that ``limit_of`` names."""
+        if self.limit_of == "depth" and self.depths_mm is not None:
+            return self.depths_mm
+        return self.size_mm
+
+    @property
     def widest_mm(self) -> float:
         """Diameter of a circle in plan that holds the largest."""
         return self.size_mm[1]
@@ -354,15 +370,20 @@ class DrawnTargetConfig(Config):
         """Return the first damaged board, for programs that look at one target."""
         return self.drawn("damaged", 0)
 
-    def drawn(self, purpose: Purpose, number: int) -> custom.TargetConfig:
+    def drawn(
+        self, purpose: Purpose, number: int, chosen_mm: tuple[float, ...] | None = None
+    ) -> custom.TargetConfig:
         """Return a board of the family with its damage, ids from 1 in the order of size; of a
         hole-free one call ``hole_free()``: the damages left out are unflawed sites. Raises
-        UserError if the board is too full."""
+        UserError if the board is too full.
+
+        ``chosen_mm``: ascending sizes (``damage.limit_of``), which replace those that would be
+        drawn; all else of the board is as without."""
 
         def stream(quantity: str) -> np.random.Generator:
             return random_stream(self.seed, "drawn board", purpose, number, quantity)
 
-        damages = self._damages(stream)
+        damages = self._damages(stream, chosen_mm)
         field = "flaws"
         if not isinstance(self.damage, DrawnFlaws):
             field = "dents" if self.damage.kind == "dent" else "holes"
@@ -385,12 +406,18 @@ class DrawnTargetConfig(Config):
         # a backing that fills every hole: the face's shadow on it from the lens, in the extreme
         # poses
         backing_z_m = float(backing_corners_board_m(config, self.backing)[0, 2])
-        size_mm = _backing_size_mm(self, backing_z_m)
+        # its material casts no shadow; where it is unknown, each board has another
+        unpainted = self.model_copy(
+            update={"material": custom.ReflectanceConfig(), "backing": None}
+        )
+        size_mm = _backing_size_mm(unpainted, backing_z_m)
         backing = self.backing.model_copy(update={"size_mm": size_mm})
         return config.model_copy(update={"backing": backing})
 
-    def _damages(self, stream: Stream) -> tuple[custom.AnyDamage, ...]:
-        """Draw the damage of a board, in the order of size."""
+    def _damages(
+        self, stream: Stream, chosen_mm: tuple[float, ...] | None
+    ) -> tuple[custom.AnyDamage, ...]:
+        """Draw the damage of a board, in the order of size; its sizes are given or drawn."""
         damage = self.damage
         count = damage.per_board
         size_parts = (np.arange(count) + stream("diameters").random(count)) / count
@@ -398,9 +425,16 @@ class DrawnTargetConfig(Config):
         sizes_mm = low + (high - low) * size_parts
         if damage.sizes == "log":
             sizes_mm = low * (high / low) ** size_parts
+        if chosen_mm is not None and damage.limit_of == damage.size_of:
+            sizes_mm = np.array(chosen_mm)
         depth_stream = stream("depths")
         depth_parts = (np.arange(count) + depth_stream.random(count)) / count
         depth_parts = depth_stream.permutation(depth_parts)
+        if chosen_mm is not None and damage.limit_of == "depth":
+            # all have one size, and so one range of depths
+            shallowest_mm, deepest_mm = self._depths_mm(low)
+            depth_parts = (np.array(chosen_mm) - shallowest_mm) / (deepest_mm - shallowest_mm)
+            depth_parts = np.clip(depth_parts, 0.0, 1.0)
         place_stream = stream("places")
         places_mm = self._edge_places_mm if damage.kind == "chip" else self._places_mm
         # What is placed first has the freest choice: which size that is, is drawn too.
@@ -420,13 +454,18 @@ class DrawnTargetConfig(Config):
             damages.append(self._damage(facts, stream))
         return tuple(damages)
 
-    def _depth_mm(self, size_mm: float, part: float) -> float:
-        """Return the depth at a part, 0..1, of the range that a damage of this size can have."""
+    def _depths_mm(self, size_mm: float) -> tuple[float, float]:
+        """Return the range of depths that a damage of this size can have."""
         least_mm, most_mm = self.damage.depths_mm or (0.0, 0.0)
         if self.damage.kind == "dent":
             legal_mm = _dent_depths_mm(size_mm, _tightest_per_mm(self.board))
             least_mm = max(least_mm, legal_mm[0])
             most_mm = min(most_mm, legal_mm[1])
+        return least_mm, most_mm
+
+    def _depth_mm(self, size_mm: float, part: float) -> float:
+        """Return the depth at a part, 0..1, of the range that a damage of this size can have."""
+        least_mm, most_mm = self._depths_mm(size_mm)
         return float(min(least_mm + (most_mm - least_mm) * part, most_mm))
 
     def _damage(self, facts: dict[str, Any], stream: Stream) -> custom.AnyDamage:

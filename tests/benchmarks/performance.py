@@ -370,9 +370,6 @@ def rate_of(tasks: list[Any]) -> float:
     return len(tasks) / (time.perf_counter() - began)
 
 
-WAYS = {"drawn at once": "false", "frame by frame": "true"}
-
-
 def trials(runs: int) -> None:
     """Print whole trials a second: frames, average, crop, fit, findings, sizes, matching and a
     study's rows; of detectors that learn nothing, as what `matched` has learned comes from boards
@@ -387,17 +384,8 @@ def trials(runs: int) -> None:
             "local": ("detector={name: local, settings: {crop: {kind: auto, inset_px: 4}}}",),
         }
         for name, detector in detectors.items():
-            for direction, exact in WAYS.items():
-                spent = seconds(
-                    partial(
-                        run_all, trials_of(Path(folder), 1, *detector, f"capture.exact={exact}")
-                    ),
-                    runs,
-                )
-                print(
-                    f"  {name:24} {direction:16} {1 / spent:8.1f} a second ({1e3 * spent:.1f} ms)",
-                    flush=True,
-                )
+            spent = seconds(partial(run_all, trials_of(Path(folder), 1, *detector)), runs)
+            print(f"  {name:24} {1 / spent:8.1f} a second ({1e3 * spent:.1f} ms)", flush=True)
 
 
 def growth(runs: int) -> None:
@@ -429,18 +417,12 @@ def growth(runs: int) -> None:
         def tried(*said: str, boards: int = 1) -> Work:
             return partial(run_all, trials_of(folder, 1, *said, boards=boards))
 
-        for direction, exact in WAYS.items():
-            works = {
-                n: tried(f"capture.frames={n}", f"capture.exact={exact}")
-                for n in (25, 50, 100, 200)
-            }
-            exponent(f"frames: trials {direction}", works, runs)
+        by_frames = {n: tried(f"capture.frames={n}") for n in (25, 50, 100, 200)}
+        exponent("frames: trials", by_frames, runs)
         drilled = "source.target.damage={{kind: through, per_board: {}, diameter_mm: [4.0, 8.0]}}"
+        exponent("holes: trials", {n: tried(drilled.format(n)) for n in (1, 2, 4, 8)}, runs)
         exponent(
-            "holes: trials drawn at once", {n: tried(drilled.format(n)) for n in (1, 2, 4, 8)}, runs
-        )
-        exponent(
-            "boards: trials drawn at once",
+            "boards: trials",
             {n: tried(boards=n) for n in (1, 2, 4)},
             max(3, runs // 3),
         )

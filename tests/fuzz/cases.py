@@ -103,6 +103,16 @@ REFERENCES = tuple(
     )
     for name in ("part.stl", "text.stl", "part.ply", "part.obj", "part.glb")
 )
+EARLIER = tuple(
+    Case(
+        "detect",
+        f"pngs {LOCAL} --reference {name} --tolerance depth=1mm",
+        ["pngs", name.split("/")[0]],
+        [name],
+        weight=2,
+    )
+    for name in ("npz/depth.npz", "ply/a.ply")
+)
 LENSES = tuple(
     Case(
         "detect",
@@ -216,7 +226,7 @@ OTHERS = (
          ["runs/out/tiny/[0-9a-f]*/*"], weight=2),
     Case("clean", "cache --all --out runs/out --dry-run", ["runs"], ["runs/out/.cache/renders/*"]),
 )  # fmt: skip
-CASES = (*CAPTURES, *REFERENCES, *LENSES, *VIEWS, *CAMERAS, *EXPERIMENTS, *OTHERS)
+CASES = (*CAPTURES, *REFERENCES, *EARLIER, *LENSES, *VIEWS, *CAMERAS, *EXPERIMENTS, *OTHERS)
 ODD_ARGUMENT = 0.08
 """Share of the inputs whose fault is an argument instead of a file."""
 

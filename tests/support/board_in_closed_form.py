@@ -69,5 +69,5 @@ def point_of(
 ) -> TrialPoint:
     """Return a point that judges averages by the thesis' detector."""
     criteria = Criteria("thesis", SETTINGS, threshold, 0.01)
-    averaging = Averaging(AverageConfig(), exact=True)
+    averaging = Averaging(AverageConfig())
     return TrialPoint(digest, variant, frames, averaging, criteria)

@@ -81,3 +81,10 @@ def finds_the_disk_full() -> None:
     from harness.vocabulary.errors import DiskFull
 
     raise DiskFull("x.npz: the disk is full", fix="free some space")
+
+
+def works(seconds: float) -> None:
+    """Keep a processor busy for as long."""
+    until_s = time.process_time() + seconds
+    while time.process_time() < until_s:
+        pass

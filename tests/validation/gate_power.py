@@ -3,8 +3,8 @@ growth it sees.
 
 Whole studies are drawn from a model of a detector: a damage's score grows with a power of its
 size, times the luck of its place (the same whenever the board is inspected again) and of its
-board, plus noise of each inspection; the highest false score of a hole-free board is Gumbel
-distributed. Thresholds are calibrated on boards of their own, as a study does it, so the luck of
+board, plus noise of each inspection; the highest false scores of a hole-free board are those of
+a Poisson process whose highest is Gumbel distributed. Thresholds are calibrated on boards of their own, as a study does it, so the luck of
 that calibration is in the result. The baseline and the study differ in the draw of the noise
 alone; or also in the camera's noise, by which all scores of damage fall, since they are in units
 of it; or in how much luck places have, by which the curve flattens about the same a50; or in the
@@ -24,12 +24,13 @@ import numpy as np
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.evaluation.intervals import threshold_for_rate
+from harness.evaluation.peaks import threshold_from_peaks
 from harness.evaluation.study.record import (
     Calibrated,
     Inspected,
     SetUpRecord,
     StudyRecord,
+    ThresholdError,
     Unflawed,
 )
 from harness.programs.gate.verdict import compare_studies
@@ -38,6 +39,7 @@ AREA_M2 = 0.054
 NORMAL_90 = 1.2816
 """The normal distribution's 90th percentile."""
 RATE_PER_M2 = 4.0
+PEAKS = 10
 NOISES = (1.1, 1.2, 1.3, 1.4)
 FLATTER = (1.10, 1.20, 1.30)
 SHIFTS = (1 / 1.5, 0.85, 1.1, 1.2, 1.3)
@@ -120,11 +122,13 @@ def _set_up(
     luck += model.of_board * of_boards.standard_normal(size.boards)[board]
     signal = model.score / change.noise * (size_mm / model.size_mm) ** model.power * np.exp(luck)
     signal = np.abs(signal + model.noise * noise.standard_normal(n))
-    calibration = model.false_score + model.false_spread * noise.gumbel(
-        size=size.calibration_boards
-    )
+    # of a unit Poisson process, the arrival times of the highest scores
+    times = np.cumsum(noise.exponential(size=(size.calibration_boards, PEAKS)), axis=1)
+    peaks = model.false_score - model.false_spread * np.log(times)
+    calibration = peaks[:, 0]
     judged = model.false_score + model.false_spread * noise.gumbel(size=size.hole_free_boards)
-    threshold = threshold_for_rate(calibration, AREA_M2, RATE_PER_M2).value
+    calibrated = threshold_from_peaks(peaks.tolist(), AREA_M2, RATE_PER_M2)
+    threshold = calibrated.value
     names = np.tile([str(1 + hole) for hole in range(size.holes)], size.boards)
     zero = np.zeros(n)
     repeat = np.zeros(n, int)
@@ -152,6 +156,12 @@ def _set_up(
         ),
         calibrated=Calibrated(
             *np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))
+        ),
+        threshold_error=ThresholdError(
+            error=calibrated.error,
+            low_per_m2=calibrated.interval_per_m2.low,
+            high_per_m2=calibrated.interval_per_m2.high,
+            method=calibrated.method,
         ),
     )
 

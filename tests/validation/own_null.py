@@ -29,7 +29,7 @@ from detectors import load_detector
 from detectors.averages.average import AverageConfig
 from detectors.findings.null import own_threshold
 from detectors.interface import Detector
-from harness.trials.averages import averages_of
+from harness.trials.averages import Averaging, averages_of
 from harness.vocabulary.geometry import MM, Cloud, transform_points
 from harness.vocabulary.seeds import random_stream
 from scenes.optics import RenderConfig
@@ -91,9 +91,8 @@ def boards(camera_name: str, kind: str, number: int, cache: Path) -> dict[int, B
     unit = SimulatedUnit(
         camera, CameraConfig(name=camera_name, unit_seed=FIRST_UNIT + number), view
     )
-    clouds = averages_of(
-        unit.capture(max(FRAMES), 7, role, number), FRAMES, AverageConfig(), exact=False
-    )
+    capture = unit.capture(max(FRAMES), 7, role, number)
+    clouds = averages_of(capture, FRAMES, Averaging(AverageConfig()))
     if kind == "objects":
         return {n: with_objects(cloud, target, number) for n, cloud in clouds.items()}
     holes = holes_near(target, next(iter(clouds.values()))) if kind == "drilled" else None

@@ -23,7 +23,7 @@ import pandas as pd
 from detectors import load_detector
 from detectors.averages.average import AverageConfig
 from detectors.interface import Detection, Measurement
-from harness.trials.averages import averages_of
+from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, LabelledCloud
 from harness.vocabulary.geometry import MM
 from scenes.optics import RenderConfig
@@ -122,7 +122,7 @@ def rows_of(options: argparse.Namespace, number: int) -> list[dict[str, Any]]:
     board = board_of(options, number)
     capture = board.unit.capture(max(FRAMES), 7, "damaged", number)
     rows = []
-    for frames, cloud in averages_of(capture, FRAMES, AverageConfig(), exact=False).items():
+    for frames, cloud in averages_of(capture, FRAMES, Averaging(AverageConfig())).items():
         labelled = board.labelled(cloud)
         for name, threshold in THRESHOLDS.items():
             settings = {

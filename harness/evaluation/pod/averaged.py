@@ -86,21 +86,15 @@ class WeightedCurves:
 
 @dataclass(frozen=True, eq=False)
 class ModelAverage:
-    """The curves of models that were fitted to the same hits.
-
-    ``design_effect``: factor of the variance for targets in clusters; it divides the
-    log-likelihoods, as the number of inspections of a target does (Rao and Scott, Annals of
-    Statistics 12 (1984), 46)."""
+    """The curves of models that were fitted to the same hits."""
 
     fits: Sequence[HitMissFit]
     """The models."""
-    design_effect: float = 1.0
-    """Variance with clusters over that without."""
 
     @cached_property
     def curves(self) -> WeightedCurves:
         """The curves whose weight is not negligible."""
-        grids = [_narrowed(fit, self.design_effect) for fit in self.fits]
+        grids = [_narrowed(fit) for fit in self.fits]
         largest = max(float(log_weight.max()) for _, _, log_weight in grids)
         models = []
         kept_mu = []
@@ -153,7 +147,7 @@ class ModelAverage:
     def _constant(self) -> str:
         """Return why a constant probability is not rejected; empty if it is."""
         fit = min(self.fits, key=lambda fit: fit.deviance)
-        ratio = (fit.null_deviance - fit.deviance) / fit.repeats / self.design_effect
+        ratio = (fit.null_deviance - fit.deviance) / fit.repeats
         allowed = criterion(CONFIDENCE)
         if ratio > allowed:
             return ""
@@ -190,7 +184,7 @@ def curves_of(link: str, middle: np.ndarray, width: np.ndarray) -> tuple[np.ndar
     return middle - sigma * half, sigma
 
 
-def _narrowed(fit: HitMissFit, design_effect: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _narrowed(fit: HitMissFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mu, sigma and the logarithm of the weight of a model's curves on a grid that covers
     those that matter."""
     z = fit.data.z
@@ -205,7 +199,7 @@ def _narrowed(fit: HitMissFit, design_effect: float) -> tuple[np.ndarray, np.nda
         middle, log_width = (grid.ravel() for grid in np.meshgrid(middles, log_widths))
         width = np.exp(log_width)
         mu, sigma = curves_of(fit.curve.link, middle, width * range_z)
-        log_likelihood = _log_likelihoods(fit, mu, sigma) / fit.repeats / design_effect
+        log_likelihood = _log_likelihoods(fit, mu, sigma) / fit.repeats
         log_weight = log_likelihood + log_weights(width, targets)
         matters = log_weight > log_weight.max() - NEGLIGIBLE
         narrower_middle = _ends_of(middle[matters], middles)

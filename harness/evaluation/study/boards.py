@@ -40,6 +40,9 @@ class Targets:
     excess: np.ndarray | None = None
     """If each inspection is a row: its signal (n,) above the threshold, in standard errors of the
     threshold; infinite for a damage that is found at any threshold."""
+    threshold: float = np.nan
+    """The threshold: equal ones are drawn again alike, as from one calibration, and others
+    independently."""
 
 
 def targets_of(
@@ -114,7 +117,7 @@ def refitted_sizes(
     if targets.unit is not None:
         rows.append((targets.unit, "units"))
     sizes = []
-    stream = random_stream(0, "thresholds drawn again")
+    stream = random_stream(0, "thresholds drawn again", f"{targets.threshold:.5g}")
     for weights in weights_in_blocks(draws, *rows):
         product = np.multiply.reduce(weights)
         hits = hits_at(targets, stream.standard_normal(len(product)))
@@ -218,13 +221,40 @@ def design_effect(
     """Return the variance of the size with this POD with boards as units over that with damages as
     units: 1 if damages of one board are no more alike than those of two; NaN below two boards.
 
-    Both are sandwich variances (Liang and Zeger, Biometrika 73 (1986), 13). With the score s_i
-    (2,) of a damage and the information I (2, 2) of all, the size x_p moves by g' I^-1 s_i, where
-    g (2,) holds the slopes of x_p = (level - b0) / b1 by b0 and b1. The variance is G / (G - 1)
-    times the sum of squares of these influences, summed within each of G units."""
+    Both are sandwich variances (Liang and Zeger, Biometrika 73 (1986), 13): G / (G - 1) times the
+    sum of squares of the damages' influences, summed within each of G units."""
     board_names, board_index = np.unique(targets.board, return_inverse=True)
     if len(board_names) < 2 or len(targets.board) < 3:
         return np.nan
+    influence = _influence(targets, curve, pod)
+    of_boards = _sandwich(np.bincount(board_index, influence))
+    of_targets = _sandwich(influence)
+    return of_boards / of_targets if of_targets > 0 else np.nan
+
+
+def units_effect(rows: Targets, curve: PodCurve, pod: float) -> float:
+    """Return the variance of the size with this POD with boards and units drawn over that with
+    boards alone, at least 1; ``rows``: each unit's inspections of a damage.
+
+    The variances of boards and of units add up, less that of their combinations, which both
+    contain (Cameron, Gelbach and Miller, J. Business & Economic Statistics 29 (2011), 238)."""
+    influence = _influence(rows, curve, pod)
+    assert rows.unit is not None
+    _, board = np.unique(rows.board, return_inverse=True)
+    _, unit = np.unique(rows.unit, return_inverse=True)
+    units = int(unit.max()) + 1
+    _, combination = np.unique(board * units + unit, return_inverse=True)
+    of_boards = _sandwich(np.bincount(board, influence))
+    of_units = _sandwich(np.bincount(unit, influence))
+    of_both = _sandwich(np.bincount(combination, influence))
+    return 1.0 + max(of_units - of_both, 0.0) / of_boards if of_boards > 0 else 1.0
+
+
+def _influence(targets: Targets, curve: PodCurve, pod: float) -> np.ndarray:
+    """Return by how much each row (n,) moves the size with this POD, on the curve's axis.
+
+    With the score s_i (2,) of a row and the information I (2, 2) of all, the size x_p moves by
+    g' I^-1 s_i, where g (2,) holds the slopes of x_p = (level - b0) / b1 by b0 and b1."""
     x = np.log(targets.size_mm) if curve.log_size else targets.size_mm
     up, down, _ = slopes_of_link(curve.link, (x - curve.mu) / curve.sigma)
     score = targets.hits * up - (targets.inspections - targets.hits) * down
@@ -232,10 +262,7 @@ def design_effect(
     x_at_pod = curve.mu + curve.sigma * float(link_ppf(curve.link, np.array(pod)))
     gradient = -curve.sigma * np.array([1.0, x_at_pod])
     information = design.T @ ((targets.inspections * up * down)[:, None] * design)
-    influence = (design * score[:, None]) @ np.linalg.solve(information, gradient)
-    of_boards = _sandwich(np.bincount(board_index, influence))
-    of_targets = _sandwich(influence)
-    return of_boards / of_targets if of_targets > 0 else np.nan
+    return np.asarray((design * score[:, None]) @ np.linalg.solve(information, gradient))
 
 
 def _sandwich(influence: np.ndarray) -> float:

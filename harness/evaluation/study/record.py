@@ -264,17 +264,83 @@ class SetUpRecord:
     """Findings on the damaged boards that match no damage, if kept."""
     units: Annotated[Whole, Field(ge=1)] = 1
     """Number of units of the camera. If more than one, repeat r of a damaged board shows unit r
-    modulo ``units``, and every other board has a unit of its own."""
+    modulo ``units``, and every hole-free board has a unit of its own."""
     drawn: tuple[Annotated[DrawnUnknown, AfterValidator(_one_table)], ...] = ()
     """Unknowns that differ from board to board."""
     threshold_error: ThresholdError | None = None
     """Uncertainty of the threshold; None for one that was given, and in older records."""
+    sizes_chosen: Annotated[bool, Strict()] = False
+    """Whether sizes were chosen where POD rises (`BoardDesign`), so that the damages of one board
+    are found or missed together."""
 
     @property
     def label(self) -> str:
         """Set-up and frames, for tables."""
         frames = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
         return frames if self.variant == "main" else f"{in_words(self.variant)}, {frames}"
+
+
+@dataclass(frozen=True)
+class BoardDesign:
+    """The damaged boards of a study with a precision, for one kind of damage: sizes by board, and
+    why there are no more (`harness.evaluation.study.sequential`)."""
+
+    __pydantic_config__ = FORM
+    damage: str
+    """The kind in words; empty if the study has only one."""
+    range_mm: tuple[Size, Size]
+    """Ends of the sizes."""
+    per_board: Number
+    """Damages of a board."""
+    most_boards: Number
+    """Largest number of boards."""
+    uniform_boards: Number
+    """Number of the first boards, whose sizes are drawn over the whole range."""
+    a90_mm: Size | None = None
+    """Widest 95 % interval of a90 that was asked for; None if it was asked for in percent."""
+    a90_percent: Size | None = None
+    """The same in percent of a90."""
+    chosen_mm: tuple[tuple[Size, ...], ...] = ()
+    """Sizes of each later board, ascending."""
+    reason: str = ""
+    """Why there are no more boards; empty while there are."""
+    is_reached: Annotated[bool, Strict()] = False
+    """Whether a90 of every set-up is as precise as wanted."""
+
+    @property
+    def boards(self) -> int:
+        """Number of damaged boards."""
+        return self.uniform_boards + len(self.chosen_mm)
+
+    @property
+    def wanted(self) -> str:
+        """The precision that was asked for, in words."""
+        return f"{self.a90_percent:g} %" if self.a90_mm is None else f"{self.a90_mm:g} mm"
+
+    @property
+    def outcome(self) -> str:
+        """Precision, boards used and whether they sufficed, as a clause."""
+        lead = f"{self.damage}: " if self.damage else ""
+        reached = "reached" if self.is_reached else "not reached"
+        return f"{lead}a90 wanted to {self.wanted}, {reached} with {self.boards} boards"
+
+    @property
+    def sentence(self) -> str:
+        """Boards by the way in which their sizes were chosen, and why there are no more."""
+        lead = f"{self.damage}: " if self.damage else ""
+        chosen = len(self.chosen_mm)
+        return (
+            f"{lead}The 95 % interval of a90 was to be at most {self.wanted} wide. Of "
+            f"{self.boards} boards, {self.uniform_boards} have sizes over the whole range and "
+            f"{chosen} sizes in the intervals of a50 and a90 known before. No more boards: "
+            f"{self.reason}."
+        )
+
+    def sizes_mm(self, board: int) -> tuple[float, ...] | None:
+        """Return the chosen sizes of a board; None for one of the first."""
+        if board < self.uniform_boards:
+            return None
+        return self.chosen_mm[board - self.uniform_boards]
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,6 +364,8 @@ class StudyRecord:
     """Set-ups in the experiment's order."""
     hit_overlap: Size | None = None
     """Share of a finding's pixels on a damage from which it is a hit; None if not used."""
+    designs: tuple[BoardDesign, ...] = ()
+    """Damaged boards of each kind of damage, if the study has a precision."""
 
     @property
     def hit_rule(self) -> str:

@@ -177,12 +177,29 @@ def validity_of(
     (``source``, ...)."""
     sections = (
         ("What was inspected", _inspected(limits, facts.get("sweep") or {})),
+        ("Precision", _precision(record)),
         ("What counts as a hit", _hits(record, limits)),
         ("Departures from MIL-HDBK-1823A", _departures(limits, chances, facts)),
         ("What is not included", _missing(limits, facts)),
         ("What is measured and what is simulated", tuple(facts.get("implanted", ()))),
     )
     return tuple((heading, sentences) for heading, sentences in sections if sentences)
+
+
+def _precision(record: StudyRecord) -> tuple[str, ...]:
+    """Return how many boards a study with a precision took, and what its sizes do to others."""
+    if not record.designs:
+        return ()
+    sentences = [design.sentence for design in record.designs]
+    sentences.append(
+        "a90/95 is that with the boards' design effect, since damages of chosen sizes on one board "
+        "tend to be found or missed together."
+    )
+    sentences.append(
+        "Shares over all damages, such as the ROC, are those of these sizes; they lie higher or "
+        "lower with sizes over the whole range."
+    )
+    return tuple(sentences)
 
 
 def _hits(record: StudyRecord, limits: Sequence[SetUpLimit]) -> tuple[str, ...]:
@@ -275,9 +292,9 @@ def _departures(
         ),
         (
             units > 1,
-            f"{units} units of the camera inspected each damaged board, and every other board was "
-            "recorded by its own unit. Intervals of sizes resample units and boards; patches of "
-            "one sensor are assumed to be alike.",
+            f"{units} units of the camera inspected each damaged board, and every board on which "
+            "false calls were counted was recorded by its own unit. Intervals of sizes resample "
+            "units and boards; patches of one sensor are assumed to be alike.",
         ),
         (
             any(limit.record.calibration_runs for limit in limits),
@@ -445,9 +462,12 @@ def _value_at(facts: Mapping[str, Any], path: str) -> Any:
 
 
 def _declared_damages(facts: Mapping[str, Any]) -> int:
-    """Return the number of damages of the experiment: drawn on all boards, or holes of one."""
+    """Return the number of damages of the experiment: drawn on all boards, or holes of one; 0 if
+    their number follows from a precision."""
     target = facts.get("source", {}).get("target") or {}
     study = facts.get("study") or {}
+    if study.get("precision"):
+        return 0
     drawn: int = target.get("damage", {}).get("per_board", 0) * study.get("boards", 0)
     return drawn or len(target.get("holes") or ())
 
@@ -495,7 +515,8 @@ class StudyResult:
     def conditions(self) -> str:
         """Return what all set-ups have in common, in one line."""
         fewest = min((limit.targets for limit in self.limits), default=None)
-        conditions = conditions_of(self.facts, fewest)
+        precisions = [design.outcome for design in self.record.designs]
+        conditions = ", ".join(filter(None, [conditions_of(self.facts, fewest), *precisions]))
         errors = [result.limit.record.threshold_error for result in self.set_ups]
         known = [error for error in errors if error is not None]
         if not known:

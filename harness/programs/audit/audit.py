@@ -2,7 +2,7 @@
 
 import argparse
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from harness.vocabulary.program import program, whole_number
 
 if TYPE_CHECKING:
     from harness.programs.audit.rows import Audited
-    from harness.programs.audit.studies import Claim, StudyCase
+    from harness.programs.audit.studies import Claim
 
 STUDIES = 300
 QUICK_STUDIES = 30
@@ -77,20 +77,23 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def rows_of_simulated(studies: int, jobs: int) -> list["Audited"]:
     """Return the rows of ``studies`` simulated studies of each case."""
-    from harness.programs.audit.studies import STUDY_CASES
+    from harness.programs.audit.precise_studies import PRECISE_CASES, claims_of_precise_study
+    from harness.programs.audit.studies import STUDY_CASES, claims_of_study
 
     rows = []
     for case in STUDY_CASES:
-        claims = [claim for of_study in _judged(case, studies, jobs) for claim in of_study]
-        rows += _rows(case.name, claims)
+        judged = _judged(partial(claims_of_study, case), studies, jobs)
+        rows += _rows(case.name, [claim for of_study in judged for claim in of_study])
+    for precise in PRECISE_CASES:
+        judged = _judged(partial(claims_of_precise_study, precise), studies, jobs)
+        rows += _rows(precise.name, [claim for of_study in judged for claim in of_study])
     return rows
 
 
-def _judged(case: "StudyCase", studies: int, jobs: int) -> Iterator[list["Claim"]]:
+def _judged(
+    judge: Callable[[int], list["Claim"]], studies: int, jobs: int
+) -> Iterator[list["Claim"]]:
     """Yield the claims of each study."""
-    from harness.programs.audit.studies import claims_of_study
-
-    judge = partial(claims_of_study, case)
     if jobs == 1:
         yield from map(judge, range(studies))
         return

@@ -17,7 +17,7 @@ class Audited:
     case: str
     """Studies or boards of which it was stated."""
     nominal: float
-    """Nominal coverage."""
+    """Nominal coverage; NaN of a row that states none."""
     held: int
     """Number of statements that held."""
     stated: int
@@ -38,7 +38,9 @@ class Audited:
 
     @property
     def verdict(self) -> str:
-        """``as stated``, ``too seldom`` or ``more often``."""
+        """``as stated``, ``too seldom``, ``more often``; ``no coverage`` if none is nominal."""
+        if np.isnan(self.nominal):
+            return "no coverage"
         if self.interval.below(self.nominal):
             return "too seldom"
         if self.interval.above(self.nominal):
@@ -86,7 +88,7 @@ AUDIT = Table(
             "median ratio",
             "ratio",
             "median of upper end or stated size over the truth; for counted rates the median "
-            "rate per m²",
+            "rate per m², for precisions the median number of damaged boards",
         ),
         Column("verdict", "verdict", "verdict", "whether the interval holds the nominal coverage"),
     ),

@@ -15,7 +15,7 @@ from scipy import optimize, special, stats
 
 from harness.evaluation.intervals import Interval
 from harness.evaluation.peaks import RateThreshold, threshold_from_peaks
-from harness.evaluation.study.limit import limit_of
+from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import (
     Inspected,
     SetUpRecord,
@@ -105,8 +105,13 @@ class Claim:
 def claims_of_study(case: StudyCase, number: int) -> list[Claim]:
     """Draw study ``number`` of a case, judge it, and compare what it states with the truth."""
     random = random_stream(0, "audit", case.name, number)
-    threshold = _threshold(case, random)
+    threshold = drawn_threshold(case, random)
     limit = limit_of(_record(case, threshold, random), draws=DRAWS)
+    return claims_of(case, threshold, limit)
+
+
+def claims_of(case: StudyCase, threshold: RateThreshold, limit: SetUpLimit) -> list[Claim]:
+    """Compare what a study states with the truth."""
     a50_mm = case.size_at(0.5)
     a90_mm = case.size_at(0.9)
     claims = [
@@ -134,7 +139,7 @@ def _bound_claim(quantity: str, bound_mm: float, truth_mm: float) -> Claim:
     return Claim(quantity, 0.95, bound_mm >= truth_mm, bound_mm / truth_mm)
 
 
-def _threshold(case: StudyCase, random: np.random.Generator) -> RateThreshold:
+def drawn_threshold(case: StudyCase, random: np.random.Generator) -> RateThreshold:
     """Set the threshold by hole-free boards."""
     law = LAWS[case.law]
     # the highest of n places of either sign: uniform order statistics, from the top
@@ -151,9 +156,23 @@ def _record(case: StudyCase, threshold: RateThreshold, random: np.random.Generat
     size_mm = random.permutation(np.linspace(*SIZES_MM, count))
     shift_mm = (case.shift_mm * random.standard_normal(case.boards))[board]
     above_mm = size_mm - A50_MM - shift_mm + case.width_mm * random.logistic(size=count)
+    calls = random.poisson(case.rate_at(threshold.value) * AREA_M2, COUNTED_BOARDS)
+    return recorded(case, threshold, size_mm=size_mm, above_mm=above_mm, calls=calls)
+
+
+def recorded(
+    case: StudyCase,
+    threshold: RateThreshold,
+    *,
+    size_mm: np.ndarray,
+    above_mm: np.ndarray,
+    calls: np.ndarray,
+) -> SetUpRecord:
+    """Return the record of a study whose damages (n,), board by board, lie ``above_mm`` (n,) what
+    is found at the wanted threshold; ``calls`` (m,): false calls of the boards that count them."""
+    boards = len(size_mm) // case.holes
     signal = case.wanted_threshold + SIGNAL_PER_MM * above_mm
     hit = signal > threshold.value
-    calls = random.poisson(case.rate_at(threshold.value) * AREA_M2, COUNTED_BOARDS)
     return SetUpRecord(
         variant="main",
         frames=1,
@@ -167,17 +186,17 @@ def _record(case: StudyCase, threshold: RateThreshold, random: np.random.Generat
         targets_digest="simulated",
         frames_digest="simulated",
         inspected=Inspected(
-            board=board,
-            hole=np.tile(np.arange(case.holes).astype(str), case.boards),
-            repeat=np.zeros(count, int),
+            board=np.repeat(np.arange(boards), case.holes),
+            hole=np.tile(np.arange(case.holes).astype(str), boards),
+            repeat=np.zeros(len(size_mm), int),
             diameter_mm=size_mm,
-            depth_mm=np.full(count, 5.0),
-            x_mm=np.zeros(count),
-            y_mm=np.zeros(count),
+            depth_mm=np.full(len(size_mm), 5.0),
+            x_mm=np.zeros(len(size_mm)),
+            y_mm=np.zeros(len(size_mm)),
             hit=hit,
             signal=signal,
             by_depth=hit,
-            by_no_return=np.zeros(count, bool),
+            by_no_return=np.zeros(len(size_mm), bool),
         ),
         unflawed=Unflawed(
             board=1000 + np.arange(COUNTED_BOARDS),

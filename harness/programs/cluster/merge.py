@@ -7,7 +7,7 @@ from math import isclose
 from pathlib import Path
 from typing import Any
 
-from harness.runs.journal import THRESHOLDS, Journal
+from harness.runs.journal import NOT_TRIALS, Journal
 from harness.runs.shards import locked
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, write_bytes
@@ -93,9 +93,9 @@ def merge_into(into: Journal, source: Journal, counts: Counter[str]) -> list[str
         stored = into.read(key)
         if stored is None or (stored.state != "done" and entry.state == "done"):
             into.write(key, entry)
-            counts["copied"] += not key.startswith(THRESHOLDS)
+            counts["copied"] += not key.startswith(NOT_TRIALS)
             continue
-        counts["known"] += not key.startswith(THRESHOLDS)
+        counts["known"] += not key.startswith(NOT_TRIALS)
         if stored.state == entry.state == "done" and stored.value != entry.value:
             first = _without_seconds(stored.record)
             second = _without_seconds(entry.record)

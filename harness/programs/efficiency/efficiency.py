@@ -42,6 +42,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.efficiency.statistics import efficiency_of, warnings_of
     from harness.programs.efficiency.tables import DAMAGES, EFFICIENCY, damage_rows
     from harness.runs.plan import plan_of
+    from harness.runs.precision import recorded_designs
     from harness.runs.tables import write_tables
     from harness.vocabulary.files import write_text
     from harness.vocabulary.provenance import RESULTS_VERSION, record
@@ -75,7 +76,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             fix=fix,
         )
     cache = folder.parents[1] / ".cache" / "renders"
-    plan = plan_of(experiment.at_stated_values(), cache)
+    stated = experiment.at_stated_values()
+    plan = plan_of(stated, cache, designs=recorded_designs(stated, study))
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)

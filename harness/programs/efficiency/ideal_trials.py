@@ -21,7 +21,7 @@ from harness.programs.efficiency.ideal_observer import (
 from harness.runs.job_batches import carried_out, render_missing
 from harness.runs.jobs import Job, JobEngine
 from harness.runs.plan import Batch, RenderJob, SweepPlan
-from harness.trials.averages import averages_of
+from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, load_board
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
@@ -166,9 +166,8 @@ def _noise_m(
         labels = ("units of the ideal observer", board, number)
         seed = int(random_stream(point.config.seed, *labels).integers(2**31))
         frames = _unit(set_up, unit_seed=seed).capture(capture.frames, point.config.seed, *labels)
-        cloud = averages_of(frames, [capture.frames], capture.average, exact=capture.exact)[
-            capture.frames
-        ]
+        clouds = averages_of(frames, [capture.frames], Averaging(capture.average))
+        cloud = clouds[capture.frames]
         noise = np.where(intact, cloud.points_m[..., 2], np.nan)
         is_known = np.isfinite(noise)
         basis = surface[:, is_known].T

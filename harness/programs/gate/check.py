@@ -91,6 +91,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         raise UserError(
             f"{options.experiment}: has no `study`", fix="name an experiment with a study of limits"
         )
+    if study.precision is not None:
+        raise UserError(
+            f"{options.experiment}: a check compares the same boards, but those of a study with a "
+            "precision follow from its results",
+            fix="add --set study.precision=null",
+        )
     needed = fewest_boards(set_ups)
     if (
         study.boards < needed

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.evaluation.intervals import SITES_PER_TARGET
+from harness.evaluation.pod.averaged import METHOD
 from harness.evaluation.pod.curve import PodCurve
-from harness.evaluation.pod.hit_miss import METHOD
 from harness.evaluation.pod.statement import LEAST_TARGETS, POD
 from harness.programs.inspections import design_statistics as planned
 from harness.records.schema import Column, Table
@@ -220,7 +220,7 @@ def notes(design: StudyDesign) -> list[str]:
         )
     return [
         *texts,
-        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by "
+        f"medians and quantiles are over {plan.studies} simulated studies, with bounds by the "
         f"{METHOD}; the standard error of the share that demonstrates a limit is at most "
         f"{50 / np.sqrt(plan.studies):.1f} percentage points",
         "repeats of the noise are not additional targets: 50 inspections of each of 8 holes count "

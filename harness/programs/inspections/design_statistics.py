@@ -8,9 +8,10 @@ import numpy as np
 from scipy import stats
 
 from harness.evaluation.intervals import threshold_for_rate
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import PodCurve, link_ppf
-from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
-from harness.evaluation.pod.statement import CONFIDENCE, LEAST_TARGETS, POD
+from harness.evaluation.pod.hit_miss import choose_model, near_models
+from harness.evaluation.pod.statement import LEAST_TARGETS, POD
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.seeds import random_stream
 
@@ -66,12 +67,12 @@ def design(
     targets: Sequence[int],
     range_of_sizes: tuple[float, float],
     *,
-    studies: int = 200,
+    studies: int = 100,
     seed: int = 0,
 ) -> tuple[StudyPlan, ...]:
-    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed with the
-    guess's link and axis. A study in which all or no targets are found, or whose POD does not grow
-    with size, demonstrates nothing."""
+    """Simulate a `StudyPlan` of evenly spread sizes for each number of targets, analysed as real
+    studies are, by the average over all models that fit about equally well. A study in which all
+    or no targets are found, or whose POD does not grow with size, demonstrates nothing."""
     plans = []
     for number in targets:
         sizes = even_sizes(number, range_of_sizes)
@@ -79,10 +80,10 @@ def design(
         stream = random_stream(seed, "pod design", number, "uniform")
         for study, hits in enumerate(stream.random((studies, number)) < guess.pod(sizes)):
             try:
-                fit = fit_hit_miss(sizes, hits, link=guess.link, log_size=guess.log_size)
+                fits = choose_model(sizes, hits)
             except UserError:
                 continue  # no limit: all or no targets are found, or POD does not grow with size
-            bounds[study] = bound(fit, POD, CONFIDENCE).value
+            bounds[study] = ModelAverage(near_models(fits)).bound(POD).value
         # order statistics, because a number and infinity have no mean
         low, median, high = np.quantile(bounds, [0.1, 0.5, 0.9], method="inverted_cdf").tolist()
         plan = StudyPlan(

@@ -116,7 +116,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     curve = _curve(options)
     # sizes are spread evenly: sizes only where the study's curve rises show nothing if the real
     # curve rises elsewhere
-    (chosen,) = plan.design(curve, [options.targets], (low, high), studies=100, seed=SEED)
+    (chosen,) = plan.design(curve, [options.targets], (low, high), studies=40, seed=SEED)
     true_mm = PRIOR_SIZE * curve.size_at(0.9)
     if not low < true_mm < high:
         print(

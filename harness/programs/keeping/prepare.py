@@ -53,21 +53,20 @@ def draw_frames() -> None:
 
 
 def analyse() -> None:
-    """Draw an average at once, and search for damage on every kind of surface."""
+    """Average frames, and search for damage on every kind of surface."""
     from detectors import load_detector
-    from detectors.averages.average import AverageConfig
-    from harness.trials.averages import FEWEST_FRAMES, averages_of
+    from detectors.averages.average import AverageConfig, average
     from harness.vocabulary.geometry import Region
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import load_camera
     from scenes.sensor.common.config import CameraConfig
-    from scenes.sensor.source import SimulatedUnit
+    from scenes.sensor.source import WHOLE_FRAMES, SimulatedUnit
 
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
     view.phasor[:, 18:24, 28:34] *= 1j
-    capture = SimulatedUnit(camera, CameraConfig(edge_gate=False), view).capture(FEWEST_FRAMES, 1)
-    cloud = averages_of(capture, [FEWEST_FRAMES], AverageConfig(), exact=False)[FEWEST_FRAMES]
+    unit = SimulatedUnit(camera, CameraConfig(edge_gate=False), view)
+    cloud = average(unit.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     wanted = [

@@ -305,14 +305,14 @@ def _answer(scores: Sequence[scoring.Score]) -> str:
     shares_of_groups = ""
     if len(by_group) > 1:
         shares = [f"{name} {share(group_scores)}" for name, group_scores in by_group.items()]
-        shares_of_groups = f" ({', '.join(shares)})"
+        shares_of_groups = f"by camera, {', '.join(shares)}; "
     values = [score for score in blind if score.strict is not None]
     bounds = [score for score in blind if score.strict is None]
     strict = sum(score.strict is True for score in values)
     wide = sum(score.passes_by_tolerance for score in values)
-    text = f"{share(blind)} blind figures pass{shares_of_groups}: "
+    text = f"{share(blind)} blind figures pass; "
     text += f"{strict} of {len(values)} values within 25 %, {wide} by a wider tolerance of the "
-    text += f"source, {share(bounds)} bounds; "
+    text += f"source, {share(bounds)} bounds; {shares_of_groups}"
     text += f"{share(by_use['calibration'])} figures that calibrated a camera pass; "
     text += f"{share(by_use['code'])} checks of the code pass."
     new = [score.figure.name for score in scores if score.fell_behind]

@@ -1,10 +1,8 @@
-"""Sorts pixels into those that have a range in every frame, those that have none, and those to
-simulate one by one.
+"""Finds the pixels that have a range in every frame, to first order in the noise.
 
 Each gate's quantity has a mean and a deviation to first order in the noise
-(`scenes.sensor.amcw.linear`). A pixel is sure if the engine's table of gates
-(`ranging.first_failed`) gives the same result for the worst and the best values within
-`DEVIATIONS`. If noise is too large for that, bounds that hold at any noise are used."""
+(`scenes.sensor.amcw.linear`). A pixel is sure if it passes the engine's table of gates
+(`ranging.first_failed`) with the worst values within `DEVIATIONS`."""
 
 from typing import NamedTuple
 
@@ -21,8 +19,6 @@ MOST_HIGHER = 0.025
 # in place of an unknown deviation: of a phase in radians, of an amplitude in units
 LARGEST_PHASE_NOISE = 1e3
 LARGEST_AMPLITUDE_NOISE = 1e9
-WORST = -1
-BEST = 1
 
 
 class Certainty(NamedTuple):
@@ -30,8 +26,6 @@ class Certainty(NamedTuple):
 
     always: np.ndarray
     """bool: a range in every frame, to first order in the noise."""
-    never: np.ndarray
-    """bool: no range in any frame."""
     z_m: np.ndarray
     """float32: z without noise, before rounding."""
     z_by_path: np.ndarray
@@ -42,8 +36,6 @@ class Certainty(NamedTuple):
     """float32: mean over frequencies, without noise."""
     amplitude_deviation: np.ndarray
     """float32: deviation of a frame's amplitude."""
-    reason: np.ndarray
-    """uint8: `Reason` of the pixel without noise."""
 
 
 class _Spans(NamedTuple):
@@ -72,12 +64,11 @@ class _Spans(NamedTuple):
 def certainty(
     filtered: Filtered,
     engine: ranging.DepthEngine,
-    lost: np.ndarray,
     shape: tuple[int, int],
     farthest_error_m: float,
 ) -> Certainty:
     """Sort the pixels of a view of ``shape`` whose frames are displaced by at most
-    ``farthest_error_m``. ``lost`` (n,) bool: always saturated."""
+    ``farthest_error_m``."""
     gates = engine.gates
     lattice = engine.lattice
     amplitude = filtered.amplitude
@@ -88,9 +79,7 @@ def certainty(
 
     # the engine on the mean phasors
     planes = np.stack([filtered.phasor.real, filtered.phasor.imag, amplitude], axis=1)
-    z_m, reason, _ = ranging.ranges_of(
-        planes, filtered.edge_least, lost.astype(np.uint8), engine, np.zeros(n)
-    )
+    z_m, _, _ = ranging.ranges_of(planes, filtered.edge, np.zeros(n, np.uint8), engine, np.zeros(n))
     # change of z by half a path: the range is that at which range and distance to the emitter come
     # to twice as much
     along, square, cosine = engine.geometry
@@ -111,7 +100,7 @@ def certainty(
     ranging.half_path(turn, n, lattice, np.empty(n, f4), residual2)
     unwraps = one_key & np.isfinite(residual2)
 
-    # each gate at the worst and the best values that noise and displacements allow
+    # all gates at the worst values that noise and displacements allow
     total_noise = np.sqrt((amplitude_noise**2).sum(axis=0))
     spans = _Spans(
         amplitude=amplitude,
@@ -124,35 +113,23 @@ def certainty(
         limited_m=z_m if gates.axial > 0 else range_m,
         range_reach_m=DEVIATIONS * deviation_m + farthest_error_m,
     )
-    at_worst = _first_failed(gates, spans, WORST)
-    at_best = _first_failed(gates, spans, BEST)
-
+    passes = _first_failed(gates, spans) == ranging.VALID
     linear = np.asarray((filtered.higher_share <= MOST_HIGHER).all(axis=0))
-    # a dim pixel's mean over its window, at its brightest
-    dim = np.isfinite(filtered.edge).all(axis=0) & (at_best == ranging.LOW_AMPLITUDE)
-    wrong_phases = (at_best == ranging.UNWRAP) & one_key
-    fails = (at_best == ranging.AMPLITUDE_RATIO) | wrong_phases
-    unmeasured = engine.outside_mask | lost | _edge_fails(filtered, gates) | dim | (linear & fails)
-    out_of_limits = (at_best == ranging.OUT_OF_RANGE) | (at_best == ranging.LOW_REFLECTIVITY)
-    never = unmeasured | (linear & unwraps & out_of_limits)
-    always = linear & unwraps & (at_worst == ranging.VALID) & ~never
+    always = linear & unwraps & passes & ~engine.outside_mask
     if engine.flying is not None:
         always &= ~_may_fly(
             engine.flying,
             z_m.reshape(shape),
             (DEVIATIONS * deviation_m).reshape(shape),
             linear.reshape(shape),
-            unmeasured.reshape(shape),
         )
     return Certainty(
         always=always,
-        never=never,
         z_m=z_m,
         z_by_path=z_by_path,
         deviation_m=deviation_m,
         amplitude=amplitude.mean(axis=0),
         amplitude_deviation=total_noise / f,
-        reason=reason,
     )
 
 
@@ -165,38 +142,22 @@ def _largest_edge(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
     return np.asarray(filtered.edge.mean(axis=0) + DEVIATIONS * mean_noise / len(filtered.edge))
 
 
-def _first_failed(gates: ranging.Gates, spans: _Spans, end: int) -> np.ndarray:
-    """Return the code (n,) of the first gate that fails at the `WORST` or `BEST` ``end``."""
-    low = spans.amplitude + end * spans.amplitude_reach
-    high = spans.amplitude - end * spans.amplitude_reach
+def _first_failed(gates: ranging.Gates, spans: _Spans) -> np.ndarray:
+    """Return the code (n,) of the first gate that fails at the worst values."""
+    low = spans.amplitude - spans.amplitude_reach
+    high = spans.amplitude + spans.amplitude_reach
     inputs = ranging.GateInputs(
-        edge=spans.edge if end == WORST else np.full(spans.edge.shape, -np.inf, f4),
+        edge=spans.edge,
         least=low.min(axis=0),
         greatest=high.max(axis=0),
-        total=spans.amplitude.sum(axis=0) + end * spans.total_reach,
-        residual2=np.maximum(spans.residual - end * spans.residual_reach, 0.0) ** 2,
+        total=spans.amplitude.sum(axis=0) - spans.total_reach,
+        residual2=(spans.residual + spans.residual_reach) ** 2,
         brightest=np.maximum(low.max(axis=0), 1e-9),
-        range_m=np.maximum(spans.range_m + end * spans.range_reach_m, 0.0),
-        low_m=spans.limited_m + end * spans.range_reach_m,
-        high_m=spans.limited_m - end * spans.range_reach_m,
+        range_m=np.maximum(spans.range_m - spans.range_reach_m, 0.0),
+        low_m=spans.limited_m - spans.range_reach_m,
+        high_m=spans.limited_m + spans.range_reach_m,
     )
     return np.asarray(ranging.first_failed_each(gates, inputs))
-
-
-def _edge_fails(filtered: Filtered, gates: ranging.Gates) -> np.ndarray:
-    """Find pixels (n,) whose edge sum, in one frequency or in the mean of all, always exceeds the
-    limit."""
-    limit = float(gates.edge)
-    least = filtered.edge_least
-    noise = np.maximum(filtered.edge_least_noise, 1e-9)
-    if np.isinf(limit):
-        return np.zeros(least.shape[1], bool)
-    if gates.edge_mean > 0:
-        lowest = least.sum(axis=0) - DEVIATIONS * np.sqrt((noise**2).sum(axis=0))
-        return np.asarray(lowest > limit * len(least))
-    # all frequencies below the limit at once
-    deviations = np.maximum((least - limit) / noise, 0.0)
-    return np.asarray((deviations**2).sum(axis=0) > DEVIATIONS**2)
 
 
 def _may_fly(
@@ -204,19 +165,16 @@ def _may_fly(
     z_m: np.ndarray,
     reach_m: np.ndarray,
     linear: np.ndarray,
-    unmeasured: np.ndarray,
 ) -> np.ndarray:
     """Find pixels (h, w), flat, that the gate on the finished image may remove in some frame."""
     reach_m = np.nan_to_num(reach_m)
     z_m = np.nan_to_num(z_m)
-    measured = linear & ~unmeasured
-    low = np.where(measured, z_m - reach_m, np.inf)
-    high = np.where(measured, z_m + reach_m, -np.inf)
+    low = np.where(linear, z_m - reach_m, np.inf)
+    high = np.where(linear, z_m + reach_m, -np.inf)
     square = np.ones((3, 3), np.uint8)
     nearest = np.asarray(cv2.erode(low, square))
     farthest = np.asarray(cv2.dilate(high, square))
-    undecided = (~linear & ~unmeasured).astype(int)
-    undecided_count = ndimage.convolve(undecided, np.ones((3, 3), int), mode="constant")
+    undecided_count = ndimage.convolve((~linear).astype(int), np.ones((3, 3), int), mode="constant")
     before = z_m + reach_m - nearest > gate.near_m
     behind = farthest - z_m + reach_m > gate.far_m
     # an undecided neighbour may be nearer or farther

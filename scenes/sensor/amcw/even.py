@@ -53,15 +53,14 @@ class _WindowSums(NamedTuple):
 
 
 def even_pixels(
-    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int], lost: np.ndarray
+    edge: np.ndarray, light: Light, window: FilterSettings, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum;
-    ``lost`` (n,) bool: always saturated."""
+    """Return (n,) bool: pixels before one even surface. ``edge`` (f, n): noise-free edge sum."""
     side = window.space.shape[0]
     half = side // 2
     square = np.ones((side, side), np.uint8)
     lowest = light.amplitude * (1 - DEVIATIONS * light.relative_noise)
-    unlike = lost | (lowest <= window.dim).any(axis=0)
+    unlike = (lowest <= window.dim).any(axis=0)
     unlike |= (light.phase_noise > LARGEST_NOISE).any(axis=0)
     even = np.asarray(cv2.dilate(unlike.reshape(shape).astype(np.uint8), square)) == 0
     even[:half] = False
@@ -151,7 +150,6 @@ def _noise_table(window: FilterSettings) -> NoiseTable:
         relative_noise=noise / f4(1e3),
     )
     filtered = unknown_filtered(1, count * k)
-    lost = np.zeros(count * k, bool)
     middles = np.arange(count) * k + k // 2
     noisy = middles[1:]  # the first window has no noise
     moves = linearised(
@@ -159,9 +157,8 @@ def _noise_table(window: FilterSettings) -> NoiseTable:
         light,
         window,
         (count * side, side),
-        lost,
         filtered,
-    )[0]
+    ).phase[0]
     corner_weight = window.space.ravel()[0] / window.space.sum()
     neighbour_share = np.ones(count)
     neighbour_share[1:] = moves[:, 0] / NOISES[1:] / corner_weight
@@ -226,5 +223,3 @@ def _fill_even(  # type: ignore[no-untyped-def]
             (neighbours * 6 / 16 + neighbours**2 / 8) * noise2 * noise2
             + (1 + neighbours) * edge[i] * noise2
         )
-        filtered.edge_least[i] = filtered.edge[i]
-        filtered.edge_least_noise[i] = filtered.edge_noise[i]

@@ -11,8 +11,11 @@ switching, the coarser rounding of a sample that is scaled to the longest exposu
 that differ between frequencies (except harmonics), any further post-processing. Errors of a unit's
 tables of lens, emitter and phase offsets are part of its fixed pattern and offset."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage, optimize, special
@@ -143,6 +146,17 @@ def pixel_spans(lens: Lens, slopes: np.ndarray) -> np.ndarray:
     vy = radial + y * y * radial_slope + 6 * p1 * y + 2 * p2 * x
     uy = x * y * radial_slope + 2 * p1 * x + 2 * p2 * y
     return np.asarray(1 / np.abs(ux * vy - uy**2))
+
+
+class SensorReading(NamedTuple):
+    """Light of n pixels with noise, before the filter."""
+
+    unit: np.ndarray
+    """(2, f, n) float32: real and imaginary parts of unit phasors."""
+    amplitude: np.ndarray
+    """(f, n) float32: amplitudes times the gains; `kernels.OUTSIDE` where saturated."""
+    saturated: np.ndarray
+    """(n,) uint8: 1 where a sample is saturated."""
 
 
 class AmcwImager(UnitModel[AmcwCamera]):
@@ -334,15 +348,26 @@ class AmcwImager(UnitModel[AmcwCamera]):
     ) -> DecodedFrame:
         """Draw a frame with noise from ``rng`` on the samples, then run the engine. ``error_m``
         displaces the frame."""
-        unit, amplitude, saturated = self.phasors(exposure, rng)
-        filtered, edge = self.filter(unit, amplitude, exposure.shape)
-        return self._decode(filtered, edge, saturated, error_m)
+        shape = exposure.shape
+        reading = self.reading(exposure, rng)
+        filtered, edge = self.filter(reading.unit, reading.amplitude, shape)
+        n_frequencies = len(filtered)
+        decoded = self.decode(
+            filtered=filtered.reshape(n_frequencies, 3, -1),
+            edge=edge.reshape(n_frequencies, -1),
+            saturated=reading.saturated,
+            engine=self.engine,
+            neighbours=self._neighbours,
+            error_m=error_m,
+        )
+        return DecodedFrame(
+            z_m=decoded.z_m.reshape(shape),
+            reason=decoded.reason.reshape(shape),
+            amplitude=decoded.amplitude.reshape(shape),
+        )
 
-    def phasors(
-        self, exposure: AmcwExposure, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw a noisy reading: unit phasors (2, f, n), amplitudes (f, n) times the gains,
-        saturated (n,) uint8."""
+    def reading(self, exposure: AmcwExposure, rng: np.random.Generator) -> SensorReading:
+        """Draw a noisy reading of an exposure."""
         n_frequencies, _, n = exposure.means.shape
         unit = np.empty((2, n_frequencies, n), f4)
         amplitude = np.empty((n_frequencies, n), f4)
@@ -360,7 +385,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
             amplitude,
             saturated,
         )
-        return unit, amplitude, saturated
+        return SensorReading(unit, amplitude, saturated)
 
     def filter(
         self, unit: np.ndarray, amplitude: np.ndarray, shape: tuple[int, int]
@@ -374,36 +399,46 @@ class AmcwImager(UnitModel[AmcwCamera]):
             kernels.filter_image(planes, strength, self.filter_settings, filtered[f], edge[f])
         return filtered, edge
 
-    def _decode(
-        self, filtered: np.ndarray, edge: np.ndarray, saturated: np.ndarray, error_m: float
+    def decode(
+        self,
+        filtered: np.ndarray,
+        edge: np.ndarray,
+        saturated: np.ndarray,
+        engine: ranging.DepthEngine,
+        neighbours: np.ndarray,
+        error_m: float,
     ) -> DecodedFrame:
-        """Unwrap, correct, gate and round: the remaining steps of the depth engine."""
-        n_frequencies = len(filtered)
-        shape = edge.shape[1:]
+        """Unwrap, correct, gate and round: the remaining steps of the depth engine.
+
+        Args:
+            filtered: (f, 3, n) float32, real and imaginary part and amplitude.
+            edge: (f, n) float32, edge sums.
+            saturated: (n,) uint8.
+            engine: the engine of these pixels.
+            neighbours: (n, 9) int32, indices of each pixel's neighbours and itself, -1 for none.
+            error_m: displacement of the frame.
+
+        Returns:
+            A frame of n pixels (n,).
+        """
         n = saturated.size
-        flying_gate = self.engine.flying
         z_m, reason, total = ranging.ranges_of(
-            filtered.reshape(n_frequencies, 3, -1),
-            edge.reshape(n_frequencies, -1),
-            saturated,
-            self.engine,
-            np.full(n, error_m),
+            filtered, edge, saturated, engine, np.full(n, error_m)
         )
-        if flying_gate is not None:
+        if engine.flying is not None:
             flying = np.empty((n, 1), bool)
             ranging.find_flying(
                 z_m[:, None],
                 total[:, None],
                 reason[:, None],
                 np.arange(n),
-                self._neighbours,
-                flying_gate,
+                neighbours,
+                engine.flying,
                 flying,
             )
             reason[flying[:, 0]] = ranging.EDGE
         ranging.round_valid(z_m, reason, f4(self.camera.z_step_m))
-        amplitude = total.reshape(shape) / f4(n_frequencies)
-        return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude)
+        return DecodedFrame(z_m, reason, total / f4(len(filtered)))
 
     @cached_property
     def _neighbours(self) -> np.ndarray:

@@ -1,13 +1,13 @@
 """Compiled inner loops of the continuous-wave imager up to the filtered phasor: exposure and
-phase-space filter. The filter serves a full image, or a list of pixels with `LANES` frames done
-together. Single-threaded, float32."""
+phase-space filter. The filter serves a full image, or strips of listed pixels. Single-threaded,
+float32."""
 
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from scenes.sensor.common.normals import FAST, bits_float, float_bits, fma, normal_pair
+from scenes.sensor.common.normals import FAST, bits_float, float_bits, fma
 
 f4 = np.float32
 ZERO = f4(0)
@@ -23,11 +23,7 @@ EXPONENT_BITS = np.uint32(0x7F800000)  # of a float32: the number without its ma
 
 # longest padded row of an image; a power of two would share cache lines, up to 4 times as slow
 STRIDE = 2128
-# frames of a listed pixel that are drawn together; loops over 8 n frames are vectorised from n = 4
-# on
-LANES = 56
-# listed pixels whose frames stand side by side, like the pixels of one row
-BESIDE = STRIDE // LANES
+LENGTH = 512  # columns of strips that are filtered together, which stay in the processor's cache
 TOGETHER = 5  # neighbours that are summed in one pass, which holds the sums in registers
 
 
@@ -121,63 +117,6 @@ def expose(  # type: ignore[no-untyped-def]
             amplitude[:, i] = OUTSIDE
 
 
-# ---------------------------------------------------------------- frames of listed pixels
-
-
-@numba.njit(inline="always", **FAST)
-def _start_of(j, f, n_frequencies):  # type: ignore[no-untyped-def]
-    """Return where the frames of listed pixel j start in planes (rows, f, 3, stride), with
-    `BESIDE` pixels a row."""
-    return (j // BESIDE * n_frequencies + f) * 3 * STRIDE + j % BESIDE * LANES
-
-
-@numba.njit(**FAST)
-def noisy_phasors(  # type: ignore[no-untyped-def]
-    phasor,
-    amplitude,
-    phase_noise,
-    relative_noise,
-    shares,
-    words,
-    planes,
-    noise,
-):
-    """Draw `LANES` frames of g listed pixels.
-
-    Args:
-        phasor, amplitude, phase_noise, relative_noise: (f, g) as in `light.Light`.
-        shares: (g, f) each frequency's share in the noise of z.
-        words: (g, f, lanes) uint32, random.
-        planes: (rows, f, 3, stride) unit phasors (real and imaginary part) and amplitudes of the
-            frames, from `_start_of` on; written.
-        noise: (g, lanes) sum of the phases' normals by their shares; written.
-    """
-    g, n_frequencies, _ = words.shape
-    noise[:] = ZERO
-    flat = planes.reshape(planes.size)
-    im_plane = np.uint64(STRIDE)
-    length_plane = np.uint64(2 * STRIDE)
-    for j in range(g):
-        for f in range(n_frequencies):
-            c = f4(phasor[f, j].real)
-            s = f4(phasor[f, j].imag)
-            share = shares[j, f]
-            size = f4(amplitude[f, j])
-            across_noise = f4(amplitude[f, j] * phase_noise[f, j])
-            along_noise = f4(amplitude[f, j] * relative_noise[f, j])
-            start = np.uint64(_start_of(j, f, n_frequencies))
-            for t in range(np.uint64(LANES)):
-                first, second = normal_pair(words[j, f, t])
-                along = size + along_noise * first
-                across = across_noise * second
-                length = np.sqrt(along * along + across * across)
-                inverse = ONE / max(length, SMALLEST)
-                flat[start + t] = (c * along - s * across) * inverse
-                flat[start + im_plane + t] = (s * along + c * across) * inverse
-                flat[start + length_plane + t] = length
-                noise[j, t] += share * second
-
-
 # ---------------------------------------------------------------- the joint bilateral filter
 
 
@@ -239,8 +178,7 @@ def _filter_window(  # type: ignore[no-untyped-def]
     filtered,
     edge,
 ):
-    """Filter values side by side: pixels of a row, or frames of a pixel. Indices are unsigned: the
-    compiler gathers by signed ones.
+    """Filter pixels side by side. Indices are unsigned: the compiler gathers by signed ones.
 
     Args:
         planes: flat, with re, im and amplitude `STRIDE` apart.
@@ -414,37 +352,68 @@ def filter_image(unit, amplitude, settings, filtered, edge):  # type: ignore[no-
 
 
 @numba.njit(**FAST)
-def filter_listed(planes, window, settings, filtered, edge):  # type: ignore[no-untyped-def]
-    """Filter listed pixels as `filter_image` does.
+def filter_strips(  # type: ignore[no-untyped-def]
+    unit,
+    amplitude,
+    strips,
+    settings,
+    filtered,
+    edge,
+):
+    """Filter windows in strips as `filter_image` does.
 
     Args:
-        planes: (rows + 1, f, 3, stride) from `noisy_phasors`; the last row is overwritten.
-        window: (m, k) indices of each pixel's window, -1 for none.
+        unit: (2, f, g) real and imaginary parts of unit phasors.
+        amplitude: (f, g).
+        strips: (side, s) indices of pixels; a window begins at each of the first s - side + 1
+            columns.
         settings: the `FilterSettings`.
-        filtered: (f, 3, m, lanes); written.
-        edge: (f, m, lanes); written.
+        filtered: (f, 3, s - side + 1) as in `filter_image`; written, without meaning where the
+            columns are not neighbours in the picture.
+        edge: (f, s - side + 1); written.
     """
-    n_frequencies, _, m, _ = filtered.shape
-    planes[-1] = OUTSIDE
-    flat = planes.reshape(planes.size)
+    n_frequencies = len(amplitude)
+    side = len(strips)
+    half = side // 2
+    # the last row stays outside, for the neighbours that fill up the list
+    rows = np.zeros(3 * (side + 1) * STRIDE, np.float32)
+    rows[(3 * side + 2) * STRIDE :] = OUTSIDE
     space = _padded(settings.space)
-    k = window.shape[1]
-    outside = (len(planes) - 1) * n_frequencies * 3 * STRIDE
+    starts = np.full(space.size, np.uint64(3 * side * STRIDE))
+    for q in range(side * side):
+        starts[q] = 3 * (q // side) * STRIDE + q % side
     total = np.empty(5 * STRIDE, np.float32)
-    starts = np.full(space.size, np.uint64(outside))
-    for p in range(m):
+    for first in range(0, edge.shape[1], LENGTH):
+        last = min(first + LENGTH, edge.shape[1])
         for f in range(n_frequencies):
-            for q in range(k):
-                j = window[p, q]
-                starts[q] = _start_of(j, f, n_frequencies) if j >= 0 else outside
+            for row in range(side):
+                _gather(
+                    unit[0, f],
+                    unit[1, f],
+                    amplitude[f],
+                    strips[row, first : last + 2 * half],
+                    rows[3 * row * STRIDE :],
+                )
             _filter_window(
-                flat,
-                starts[k // 2],
+                rows,
+                3 * half * STRIDE + half,
                 starts,
                 space,
-                LANES,
+                last - first,
                 settings,
                 total,
-                filtered[f, :, p],
-                edge[f, p],
+                filtered[f, :, first:last],
+                edge[f, first:last],
             )
+
+
+@numba.njit(**FAST)
+def _gather(re, im, amplitude, indices, row):  # type: ignore[no-untyped-def]
+    """Write the pixels at ``indices`` into a row of planes, `STRIDE` apart."""
+    im_plane = np.uint64(STRIDE)
+    amplitude_plane = np.uint64(2 * STRIDE)
+    for x in range(np.uint64(indices.size)):
+        i = np.uint64(indices[x])
+        row[x] = re[i]
+        row[im_plane + x] = im[i]
+        row[amplitude_plane + x] = amplitude[i]

@@ -39,11 +39,6 @@ DEVIATIONS = 4.5
 LARGEST_NORMAL = 0.35
 # limit of the phase noise in radians, which would be too large for float32 where there is no light
 LARGEST_PHASE_NOISE = 1e3
-# the mean resultant length of a phase is concave in 1 / noise: its slope at 0, sqrt(pi / 8),
-# bounds it
-RESULTANT_SLOPE = 0.6267
-# variance of (1 - cos)/2 of a uniform phase: no other phase scatters more
-UNIFORM_VARIANCE = 0.125
 f4 = np.float32
 REACH = f4(DEVIATIONS)
 SQRT_3 = f4(np.sqrt(3.0))
@@ -86,11 +81,17 @@ class Filtered(NamedTuple):
     count; infinite if unknown."""
     edge_noise: np.ndarray
     """(f, n) float32: its deviation; infinite if unknown."""
-    edge_least: np.ndarray
-    """(f, n) float32: mean of the edge sum without uncertain neighbours; if unknown, a lower bound
-    that holds at any noise."""
-    edge_least_noise: np.ndarray
-    """(f, n) float32: its deviation; if unknown, a bound that holds at any noise."""
+
+
+class Moves(NamedTuple):
+    """Changes of m pixels by one deviation of the noise of each of their k neighbours, at f
+    frequencies."""
+
+    phase: np.ndarray
+    """(f, m, k) float32: of the phase, in radians, by the neighbour's phase."""
+    amplitude: np.ndarray
+    """(f, m, k) float32: of the amplitude, by the neighbour's amplitude; changes by its phase are
+    added as if they were by its amplitude, with the sign of the larger."""
 
 
 def unknown_filtered(frequencies: int, n: int) -> Filtered:
@@ -104,8 +105,6 @@ def unknown_filtered(frequencies: int, n: int) -> Filtered:
         higher_share=np.full(shape, np.inf, f4),
         edge=np.full(shape, np.inf, f4),
         edge_noise=np.full(shape, np.inf, f4),
-        edge_least=np.zeros(shape, f4),
-        edge_least_noise=np.full(shape, np.inf, f4),
     )
 
 
@@ -114,26 +113,21 @@ def linearised(
     light: Light,
     window: FilterSettings,
     shape: tuple[int, int],
-    lost: np.ndarray,
     filtered: Filtered,
-) -> np.ndarray:
-    """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise turns
+) -> Moves:
+    """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise moves
     them.
 
     Args:
-        pixels: (m,) flat indices; none of them is lost.
+        pixels: (m,) flat indices.
         light: of the whole view, n pixels.
         window: the filter's settings, with a window of k pixels.
         shape: (h, w) of the view.
-        lost: (n,) bool, pixels that are always saturated.
         filtered: of the whole view; written at ``pixels``.
-
-    Returns:
-        (f, m, k) float32: change of a pixel's phase in radians by one deviation of each
-        neighbour's noise.
     """
-    moves = np.zeros((len(light.phase_noise), len(pixels), window.space.size), f4)
-    for f, moves_of_frequency in enumerate(moves):
+    shape_of_moves = (len(light.phase_noise), len(pixels), window.space.size)
+    moves = Moves(np.zeros(shape_of_moves, f4), np.zeros(shape_of_moves, f4))
+    for f in range(len(light.phase_noise)):
         light_of_frequency = Light._make(part[f] for part in light)
         filtered_of_frequency = Filtered._make(part[f] for part in filtered)
         _linearise(
@@ -141,9 +135,9 @@ def linearised(
             light_of_frequency,
             window,
             shape,
-            lost,
             filtered_of_frequency,
-            moves_of_frequency,
+            moves.phase[f],
+            moves.amplitude[f],
         )
     return moves
 
@@ -187,9 +181,9 @@ def _linearise(  # type: ignore[no-untyped-def]
     light,
     window,
     shape,
-    lost,
     filtered,
     moves,
+    amplitude_moves,
 ):
     """Do the work of `linearised` for one frequency; arrays have no first axis."""
     k = window.space.size
@@ -210,7 +204,6 @@ def _linearise(  # type: ignore[no-untyped-def]
             light,
             window.space,
             shape,
-            lost,
             values,
         )
         _choose_neighbours(window, centre, neighbours, values, sums)
@@ -232,6 +225,7 @@ def _linearise(  # type: ignore[no-untyped-def]
             values,
             sums,
             filtered,
+            amplitude_moves[start : start + ABREAST],
         )
         if sums[FITS : FITS + ROW].max() > ZERO:
             _write_mean_phasors(
@@ -263,7 +257,6 @@ def _gather(  # type: ignore[no-untyped-def]
     light,
     space,
     shape,
-    lost,
     values,
 ):
     """Fill ``values`` with the windows of the pixels in ``batch`` (`ABREAST`,)."""
@@ -287,7 +280,7 @@ def _gather(  # type: ignore[no-untyped-def]
                 values[slot + MEAN_AMPLITUDE] = light.mean_amplitude[j]
                 values[slot + PHASE_NOISE] = min(light.phase_noise[j], LARGEST_PHASE_NOISE)
                 values[slot + AMPLITUDE_NOISE] = light.amplitude[j] * light.relative_noise[j]
-                values[slot + SPACE] = space[dy, dx] if inside and not lost[j] else ZERO
+                values[slot + SPACE] = space[dy, dx] if inside else ZERO
                 values[slot + MOVE] = ZERO
                 slot += VALUES
 
@@ -364,18 +357,14 @@ def _write_edges(  # type: ignore[no-untyped-def]
     sums,
     filtered,
 ):
-    """Write the edge sum's mean, deviation and bounds."""
+    """Write the edge sum's mean and deviation."""
     dim = window.dim
     dim_edges = window.dim_edges
     mean = SUMS[0]
     variance = SUMS[1]
     sines = SUMS[2]  # sum of sin t / 2: derivative by the centre's phase
     cosines = SUMS[3]  # sum of cos t / 4: half the second derivative
-    bound_variance = SUMS[4]
-    certain_count = SUMS[5]
-    doubtful_count = SUMS[6]
-    resultant = SUMS[7]  # complex: greatest sum of exp(i t) in the mean over the noise
-    sums[mean : resultant + ROW + ROW] = ZERO
+    sums[mean : cosines + ROW] = ZERO
     for slot in neighbours:
         for x in range(ROW):
             noise = values[slot + PHASE_NOISE + x]
@@ -385,10 +374,7 @@ def _write_edges(  # type: ignore[no-untyped-def]
             reach = REACH * values[slot + AMPLITUDE_NOISE + x]
             may_be_lit = values[slot + MEAN_AMPLITUDE + x] + reach >= dim
             counts = (values[slot + SPACE + x] > ZERO) & (dim_edges | may_be_lit)
-            always_lit = values[slot + AMPLITUDE + x] - reach > dim
-            certain = counts & (dim_edges | always_lit)
             counted = ONE if counts else ZERO
-            certainly = ONE if certain else ZERO
             noise2 = noise * noise
             centre2 = centre_noise * centre_noise
             shortened = max(ONE - HALF * (noise2 + centre2), ZERO)
@@ -400,44 +386,17 @@ def _write_edges(  # type: ignore[no-untyped-def]
             sums[variance + x] += counted * (
                 first * first + second * second * TWO * noise2 * (noise2 + TWO * centre2)
             )
-            sums[doubtful_count + x] += counted - certainly
-            sums[certain_count + x] += certainly
-            length = certainly * min(ONE, f4(RESULTANT_SLOPE) / max(noise, f4(1e-9)))
-            _add(sums, resultant + x, re * length, im * length)
-            # a phase that is known scatters by half its noise
-            scatter = QUARTER * noise2 if noise < f4(LARGEST_NORMAL) else f4(UNIFORM_VARIANCE)
-            sums[bound_variance + x] += certainly * scatter
     for x in range(written.size):
         i = written[x]
         centre_noise = values[centre + PHASE_NOISE + x]
-        doubtful = sums[doubtful_count + x]
         deviation = np.sqrt(
             sums[variance + x]
             + (sums[sines + x] * centre_noise) ** 2
             + 2.0 * (sums[cosines + x] * centre_noise * centre_noise) ** 2
         )
-        # mean and deviation are right if no neighbour counts, or none is too noisy
-        empty = sums[certain_count + x] + doubtful == 0
-        right = empty or sums[LARGEST_NOISE + x] <= LARGEST_NORMAL
-        certain = sums[CERTAIN + x] > 0
-        filtered.edge[i] = sums[mean + x] if right and certain else np.inf
-        filtered.edge_noise[i] = deviation if right and certain else np.inf
-        if right and doubtful == 0:
-            filtered.edge_least[i] = sums[mean + x]
-            filtered.edge_least_noise[i] = deviation
-        else:
-            # the centre's own noise turns the resultant at most that far or, where that is large,
-            # to any angle
-            re = sums[resultant + x]
-            im = sums[resultant + ROW + x]
-            angle = 0.0
-            if centre_noise < LARGEST_NORMAL:
-                angle = max(abs(np.arctan2(im, re)) - DEVIATIONS * centre_noise, 0.0)
-            nearest = np.sqrt(re * re + im * im) * np.cos(angle)
-            filtered.edge_least[i] = 0.5 * (sums[certain_count + x] - nearest)
-            filtered.edge_least_noise[i] = np.sqrt(sums[bound_variance + x])
-        if not certain:
-            filtered.edge_least[i] = 0.0
+        known = (sums[LARGEST_NOISE + x] <= LARGEST_NORMAL) & (sums[CERTAIN + x] > ZERO)
+        filtered.edge[i] = sums[mean + x] if known else np.inf
+        filtered.edge_noise[i] = deviation if known else np.inf
 
 
 # ---------------------------------------------------------------- the amplitude
@@ -453,9 +412,10 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
     values,
     sums,
     filtered,
+    moves,
 ):
-    """Write the filtered amplitude and its deviation, and the filtered phasor if noise leaves the
-    phases unchanged."""
+    """Write the filtered amplitude, its deviation and its ``moves`` (`ABREAST` or fewer, k), and
+    the filtered phasor if noise leaves the phases unchanged."""
     weights = SUMS[0]
     amplitudes = SUMS[1]
     variance = SUMS[2]
@@ -484,7 +444,9 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
             # noise across lengthens a phasor by what it takes from its mean
             size = weight * values[slot + AMPLITUDE + x]
             _add(sums, total + x, size * re, size * im)
-            sums[variance + x] += (weight * values[slot + AMPLITUDE_NOISE + x]) ** 2
+            by_length = weight * values[slot + AMPLITUDE_NOISE + x]
+            sums[variance + x] += by_length * by_length
+            values[slot + FIRST + x] = by_length
     for x in range(ROW):
         size = np.sqrt(_squared(_complex_at(sums, total + x)))
         weight_sum = max(sums[weights + x], NEVER_ZERO)
@@ -509,8 +471,12 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
                 )
             else:
                 change = slope * weight * (amplitude - values[slot + MEAN_AMPLITUDE + x])
-            sums[variance + x] += (change * min(values[slot + PHASE_NOISE + x], HALF)) ** 2
+            by_phase = change * min(values[slot + PHASE_NOISE + x], HALF)
+            sums[variance + x] += by_phase * by_phase
             sums[by_centre + x] += change
+            by_length = values[slot + FIRST + x]
+            size = np.sqrt(by_length * by_length + by_phase * by_phase)
+            values[slot + FIRST + x] = size if by_length + by_phase > ZERO else -size
     for x in range(written.size):
         i = written[x]
         of_centre = sums[by_centre + x] * min(values[centre + PHASE_NOISE + x], HALF)
@@ -519,6 +485,12 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
         filtered.amplitude_noise[i] = (
             np.sqrt(sums[variance + x] + of_centre * of_centre) / sums[weights + x]
         )
+        by_length = values[centre + WEIGHT + x] * values[centre + AMPLITUDE_NOISE + x]
+        size = np.sqrt(by_length * by_length + of_centre * of_centre)
+        values[centre + FIRST + x] = size if by_length + of_centre > ZERO else -size
+        for q in range(neighbours.size + 1):
+            move = values[np.uint64(q) * VALUES + FIRST + np.uint64(x)]
+            moves[x, q] = move / sums[weights + x]
 
 
 # ---------------------------------------------------------------- complex numbers in rows

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scenes.sensor.amcw.linear import Filtered
+from scenes.sensor.amcw.linear import Filtered, Moves
 
 NODES = ((0.0, 2 / 3), (np.sqrt(3.0), 1 / 6), (-np.sqrt(3.0), 1 / 6))  # deviations, weights
 
@@ -45,7 +45,7 @@ def derivatives(c: float, t: np.ndarray) -> list[np.ndarray]:
     return [value * factor for factor in over]
 
 
-def linearised_pixel(window: Window) -> tuple[Filtered, np.ndarray]:
+def linearised_pixel(window: Window) -> tuple[Filtered, Moves]:
     """Return the filtered pixel to first order in the noise, as scalars, and (k,) its moves."""
     centre = len(window.phase) // 2
     is_neighbour = np.arange(len(window.phase)) != centre
@@ -97,8 +97,12 @@ def linearised_pixel(window: Window) -> tuple[Filtered, np.ndarray]:
         change = plain_weight * (window.amplitude * along + slope * amplitude)
     change = change * is_neighbour
     noise = np.minimum(window.phase_noise, 0.5)
-    scatter = (weight * window.amplitude_noise) ** 2 + (change * noise * is_neighbour) ** 2
-    amplitude_noise = np.sqrt(scatter.sum() + (change.sum() * noise[centre]) ** 2) / weight.sum()
+    by_amplitude = weight * window.amplitude_noise
+    by_own_phase = change * noise
+    by_own_phase[centre] = change.sum() * noise[centre]
+    amplitude_moves = np.hypot(by_amplitude, by_own_phase) / weight.sum()
+    amplitude_moves = np.copysign(amplitude_moves, by_amplitude + by_own_phase)
+    amplitude_noise = np.sqrt((amplitude_moves**2).sum())
     if window.by_amplitude:
         amplitude *= 1 + variance / 2
 
@@ -118,7 +122,5 @@ def linearised_pixel(window: Window) -> tuple[Filtered, np.ndarray]:
         higher_share=higher / variance,
         edge=edge,
         edge_noise=edge_noise,
-        edge_least=edge,
-        edge_least_noise=edge_noise,
     )
-    return filtered, moves
+    return filtered, Moves(moves, amplitude_moves)

@@ -1,121 +1,134 @@
-"""Pixels whose frames are simulated one by one: which light they need, and the sums of their
-frames."""
+"""Pixels that go through the whole chain alone: which light they need, and their frames.
+
+The windows of runs of such pixels in a row stand side by side as strips, so that one loop filters
+them all."""
+
+from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
+import cv2
 import numpy as np
 
-from scenes.sensor.amcw import ranging
+from scenes.sensor.amcw import kernels
+from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.imager import AmcwImager, SensorReading
+from scenes.sensor.amcw.ranging import DepthEngine
 from scenes.sensor.amcw.windows import pixels_within, windows_of
-from scenes.sensor.common.normals import FAST
-from scenes.sensor.common.unit import N_REASONS
+from scenes.sensor.common.unit import DecodedFrame
 
 f4 = np.float32
 
 
 class Listed(NamedTuple):
-    """Pixels to simulate; -1 means none."""
+    """Pixels to simulate by the whole chain."""
 
+    pixels: np.ndarray
+    """(p,): flat indices of the pixels whose result is wanted."""
     halo: np.ndarray
     """(g,): flat indices of pixels whose light is needed."""
-    range: np.ndarray
-    """(m,): flat indices of pixels that get a range."""
+    exposure: AmcwExposure
+    """Their samples, as a view of 1 x (g + 1) pixels. The last one is always saturated, as the
+    filter takes saturated pixels like those beyond the picture."""
+    strips: np.ndarray
+    """(side, s) int32: indices in ``exposure`` of the columns of windows, run by run."""
+    columns: np.ndarray
+    """(m,): first column of the window of each pixel that gets a range."""
     wanted: np.ndarray
-    """(p,): indices in ``range`` of the pixels whose result is wanted."""
-    window: np.ndarray
-    """(m, k): indices in ``halo`` of each range's window."""
+    """(p,): indices of ``pixels`` among those that get a range."""
     neighbours: np.ndarray
-    """(p, 9): indices in ``range`` of each wanted pixel's neighbours and itself."""
+    """(m, 9) int32: indices of the neighbours and itself among those that get a range, -1 for
+    none."""
+    engine: DepthEngine
+    """The depth engine of the pixels that get a range."""
 
 
-class ListedSums(NamedTuple):
-    """Sums over frames of p pixels, for each of k parts of a capture."""
-
-    valid: np.ndarray
-    """(k, p) int32: number of valid samples."""
-    total: np.ndarray
-    """(k, p): of their z minus base, in steps."""
-    squares: np.ndarray
-    """(k, p): of its square."""
-    amplitude: np.ndarray
-    """(k, p): of their amplitude, the mean over frequencies."""
-    reasons: np.ndarray
-    """(k, r, p) uint16: how often each `Reason` occurred."""
-
-
-def listed_of(wanted: np.ndarray, side: int, flying: bool) -> Listed:
-    """Return the list for ``wanted`` (h, w) bool, with windows of ``side``. ``flying``: whether
-    the engine looks at a pixel's neighbours in the finished image."""
-    ranges = pixels_within(wanted, 3) if flying else wanted
+def listed_of(wanted: np.ndarray, imager: AmcwImager, exposure: AmcwExposure) -> Listed:
+    """Return the list for ``wanted`` (h, w) bool pixels of a view."""
+    engine = imager.engine
+    side = len(imager.filter_settings.space)
+    # the gate on the finished image looks at a pixel's neighbours
+    ranges = wanted if engine.flying is None else pixels_within(wanted, 3)
     halo = pixels_within(ranges, side)
-    number_in_range = _running_numbers(ranges)
-    number_in_halo = _running_numbers(halo)
     range_pixels = np.flatnonzero(ranges)
-    wanted_pixels = np.flatnonzero(wanted)
+    halo_pixels = np.flatnonzero(halo)
+    number_in_range = _running_numbers(ranges, -1)
+    number_in_halo = _running_numbers(halo, len(halo_pixels))
+    strips, columns = _strips(ranges, number_in_halo, side, len(halo_pixels))
+    of_exposure = np.append(halo_pixels, 0)
     return Listed(
-        halo=np.flatnonzero(halo),
-        range=range_pixels,
-        wanted=number_in_range.ravel()[wanted_pixels],
-        window=windows_of(number_in_halo, side, -1, range_pixels),
-        neighbours=windows_of(number_in_range, 3, -1, wanted_pixels),
+        pixels=np.flatnonzero(wanted),
+        halo=halo_pixels,
+        exposure=AmcwExposure(
+            means=np.ascontiguousarray(exposure.means[..., of_exposure]),
+            sigma=exposure.sigma[of_exposure],
+            limit=np.append(exposure.limit[halo_pixels], f4(-1)),
+            time_share=exposure.time_share[of_exposure],
+            shape=(1, len(of_exposure)),
+        ),
+        strips=strips,
+        columns=columns,
+        wanted=number_in_range[wanted],
+        neighbours=windows_of(number_in_range, 3, -1, range_pixels),
+        engine=engine._replace(
+            geometry=engine.geometry.take(range_pixels, axis=1),
+            outside_mask=engine.outside_mask[range_pixels],
+        ),
     )
 
 
-def _running_numbers(pixels: np.ndarray) -> np.ndarray:
-    """Return (h, w) int32: 0, 1, 2 .. at the ``pixels`` (h, w) bool, -1 elsewhere."""
+def _running_numbers(pixels: np.ndarray, without: int) -> np.ndarray:
+    """Return (h, w) int32: 0, 1, 2 .. at the ``pixels`` (h, w) bool, ``without`` elsewhere."""
     numbers = np.cumsum(pixels).reshape(pixels.shape) - 1
-    return np.where(pixels, numbers, -1).astype(np.int32)
+    return np.where(pixels, numbers, without).astype(np.int32)
 
 
-def empty_sums(parts: int, pixels: int) -> ListedSums:
-    """Return sums over no frame."""
-    return ListedSums(
-        valid=np.zeros((parts, pixels), np.int32),
-        total=np.zeros((parts, pixels)),
-        squares=np.zeros((parts, pixels)),
-        amplitude=np.zeros((parts, pixels)),
-        reasons=np.zeros((parts, N_REASONS, pixels), np.uint16),
+def _strips(
+    pixels: np.ndarray, numbers: np.ndarray, side: int, beyond: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ``strips`` and ``columns`` of `Listed` for pixels (h, w) bool, with the
+    ``numbers`` (h, w) of all pixels, and ``beyond`` outside the picture."""
+    half = side // 2
+    padded = np.pad(pixels, half)
+    padded_numbers = np.pad(numbers, half, constant_values=beyond)
+    # the columns of windows, run by run
+    reached = cv2.dilate(padded.view(np.uint8), np.ones((1, side), np.uint8)).view(bool)
+    places = np.cumsum(reached).reshape(reached.shape) - 1
+    width = padded.shape[1]
+    upper = np.flatnonzero(reached) - half * width
+    below = np.arange(side)[:, None] * width
+    return padded_numbers.ravel()[upper + below], places[padded] - half
+
+
+def decoded(listed: Listed, imager: AmcwImager, reading: SensorReading, error_m: float) -> DecodedFrame:
+    """Run the whole engine on a ``reading`` of the list's exposure, and return the wanted pixels
+    (p,)."""
+    strips = listed.strips
+    side = len(strips)
+    middles = strips[side // 2, listed.columns + side // 2]
+    n_frequencies = len(reading.amplitude)
+    windows = strips.shape[1] - side + 1
+    filtered = np.empty((n_frequencies, 3, windows), f4)
+    edge = np.empty((n_frequencies, windows), f4)
+    kernels.filter_strips(
+        reading.unit,
+        reading.amplitude,
+        strips,
+        imager.filter_settings,
+        filtered,
+        edge,
     )
-
-
-@numba.njit(**FAST)
-def add_listed_frames(  # type: ignore[no-untyped-def]
-    z_m,
-    reason,
-    strength,
-    flying,
-    wanted,
-    part_of,
-    share,
-    step_m,
-    base,
-    sums,
-):
-    """Add frames of listed pixels to their sums.
-
-    Args:
-        z_m, reason, strength: (m, lanes) of the pixels that get a range; ``strength`` is the sum of
-            amplitudes over the frequencies.
-        flying: (p, lanes) bool, whether the gate on the finished image removes a wanted pixel.
-        wanted: (p,) indices of the wanted pixels among those that get a range.
-        part_of: (lanes,) the part that counts a frame; -1 for none.
-        share: 1 over the number of frequencies.
-        step_m: the output's step.
-        base: (p,) whole steps that are taken off z.
-        sums: the `ListedSums` that are added to.
-    """
-    for p in range(wanted.size):
-        for t in range(part_of.size):
-            k = part_of[t]
-            if k < 0:
-                continue
-            i = wanted[p]
-            code = np.uint8(ranging.EDGE) if flying[p, t] else reason[i, t]
-            sums.reasons[k, code, p] += 1
-            if code == ranging.VALID:
-                steps = np.floor(z_m[i, t] / step_m + f4(0.5)) - base[p]
-                sums.valid[k, p] += 1
-                sums.total[k, p] += steps
-                sums.squares[k, p] += steps * steps
-                sums.amplitude[k, p] += strength[i, t] * share
+    # `take` along the last axis takes a third of the time of an index
+    frame = imager.decode(
+        filtered=filtered.take(listed.columns, axis=-1),
+        edge=edge.take(listed.columns, axis=-1),
+        saturated=reading.saturated[middles],
+        engine=listed.engine,
+        neighbours=listed.neighbours,
+        error_m=error_m,
+    )
+    return DecodedFrame(
+        z_m=frame.z_m[listed.wanted],
+        reason=frame.reason[listed.wanted],
+        amplitude=frame.amplitude[listed.wanted],
+    )

@@ -13,8 +13,6 @@ FAST: Any = {"cache": True, "fastmath": {"nsz"}, "error_model": "numpy", "nogil"
 """Compiler options of all camera kernels: operations are neither reordered nor fused, so that
 every processor gives the same bits. Values may be infinite: an unlit pixel may divide by zero and
 is gated out later."""
-# of whole numbers that float32 holds: exact in any order
-EXACT_SUMS: Any = {**FAST, "fastmath": {"nsz", "reassoc"}}
 IN_DOUBLE: Any = {**FAST, "fastmath": {"contract", "reassoc", "arcp", "nsz"}}
 """The same for float64 sums that are rounded to float32 afterwards; their order changes a range by
 1e-13 m."""
@@ -22,7 +20,6 @@ f4 = np.float32
 TWO_PI = f4(2.0 * math.pi)
 LOG_2 = f4(0.69314718)
 ROOT_2 = f4(1.41421356)
-PER_WORD_OF_16 = f4(2.0**-16)
 PER_WORD_OF_24 = f4(2.0**-24)
 MINUS_TWO = f4(-2)
 QUARTER = f4(0.25)
@@ -49,8 +46,6 @@ MANTISSA_BITS = np.uint32(0x007FFFFF)
 BITS_OF_ONE = np.uint32(0x3F800000)
 # of a word of 32 bits
 LOWER_SHIFT = np.uint32(8)
-HALF_SHIFT = np.uint32(16)
-LOWER_HALF = np.uint32(0xFFFF)
 # whole numbers
 INT_0 = np.int32(0)
 INT_1 = np.int32(1)
@@ -70,17 +65,6 @@ def normals_from_bits(bits: np.ndarray, out: np.ndarray) -> None:
         sine, cosine = _sincos_turns(v)
         out[i] = radius * cosine
         out[n + i] = radius * sine
-
-
-@numba.njit(inline="always", **FAST)
-def normal_pair(word):  # type: ignore[no-untyped-def]
-    """Return two standard normals from a uniform word of 32 bits: from 65,536 radii, up to 4.9,
-    and as many angles."""
-    u = (f4(word & LOWER_HALF) + HALF) * PER_WORD_OF_16
-    v = f4(word >> HALF_SHIFT) * PER_WORD_OF_16
-    radius = np.sqrt(MINUS_TWO * _log(u))
-    sine, cosine = _sincos_turns(v)
-    return radius * cosine, radius * sine
 
 
 @numba.njit(inline="always", **FAST)

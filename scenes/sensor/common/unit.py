@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -15,14 +14,13 @@ import numpy as np
 import scipy.fft
 from scipy import ndimage
 
-from harness.vocabulary.geometry import MM, Reason, Region
+from harness.vocabulary.geometry import MM, Region
 from harness.vocabulary.seeds import canonical_json, random_stream
 from scenes.optics import NoiseFreeView
 from scenes.sensor.common.config import CameraConfig, EffectsConfig
 from scenes.sensor.common.facts import CameraFacts, UnitFacts
 
 Camera = TypeVar("Camera", bound=CameraFacts)
-N_REASONS = max(Reason) + 1
 
 
 class DecodedFrame(NamedTuple):
@@ -34,41 +32,6 @@ class DecodedFrame(NamedTuple):
     """(h, w) uint8: the pixel's `Reason`."""
     amplitude: np.ndarray
     """(h, w): in the camera's units."""
-
-
-@dataclass(frozen=True)
-class FrameTotals:
-    """Sums over frames on pixels (h, w), with z in whole steps, so that sums are exact."""
-
-    frames: int
-    """Number of frames."""
-    step_m: float
-    """The step of z in metres."""
-    base: np.ndarray
-    """(h, w): whole steps that are taken off z."""
-    count: np.ndarray
-    """(h, w): number of valid samples."""
-    total: np.ndarray
-    """(h, w): sum of their z minus ``base``, in steps."""
-    squares: np.ndarray
-    """(h, w): sum of its square."""
-    amplitude: np.ndarray
-    """(h, w): sum of their amplitudes, in the camera's units."""
-    reasons: np.ndarray
-    """(r, h, w): how often each `Reason` occurred."""
-
-    def cut(self, part: tuple[slice, slice]) -> FrameTotals:
-        """Return the same on a part of the pixels."""
-        return FrameTotals(
-            frames=self.frames,
-            step_m=self.step_m,
-            base=self.base[part],
-            count=self.count[part],
-            total=self.total[part],
-            squares=self.squares[part],
-            amplitude=self.amplitude[part],
-            reasons=self.reasons[:, *part],
-        )
 
 
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -358,22 +358,54 @@ def test_wide_templates_fill_their_discs() -> None:
     assert np.count_nonzero(narrow) == 1
 
 
+def disc_at(row: int, column: int, shape: tuple[int, int] = (40, 50)) -> np.ndarray:
+    rows, columns = np.indices(shape)
+    return np.asarray(np.hypot(rows - row, columns - column) < 4.5)
+
+
 def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
-    values = np.zeros((40, 50), np.float32)
-    inside = np.hypot(*(np.indices(values.shape) - np.array([20, 25])[:, None, None])) < 4.5
-    values[inside] = 9.0
+    inside = disc_at(20, 25)
+    values = 9.0 * inside.astype(np.float32)
     values[20, 25] = 0.5
+    scores = 20.0 * inside.astype(np.float32)
     is_known = np.ones(values.shape, bool)
-    peaks = np.array([[20, 25]])
-    core, heights, peak_of = _cores(peaks, np.array([4.5]), values, is_known)
-    assert core[inside].all()
-    assert not core[~grown(inside, 1)].any()
-    assert heights[inside].min() > 0.3
-    assert heights.max() == 1.0
-    assert (peak_of[core] == 0).all()
+    (core,) = _cores(scores, np.full(values.shape, 4.5), values, is_known)
+    found = np.zeros(values.shape)
+    found[core.cut][core.inside] = core.signed
+    assert (found[inside] > 0.3 * 20.0).all()
+    assert not found[~grown(inside, 1)].any()
+    assert found.max() == pytest.approx(20.0)
+    assert inside[core.peak]
     # loud pixels that fill less than half of the template's disc are not its finding
-    core, _, _ = _cores(peaks, np.array([9.0]), values, is_known)
-    assert not core.any()
+    assert not _cores(scores, np.full(values.shape, 9.0), values, is_known)
+
+
+@pytest.mark.parametrize(("beside", "count"), [(20.0, 2), (-9.0, 1), (9.0, 1), (12.0, 2)])
+def test_a_loud_part_is_judged_by_its_own_score(beside: float, count: int) -> None:
+    """A template that peaks between two holes hides neither. A part whose score is below half of
+    one nearby, or of the other sign than its values, may be a lobe of that one."""
+    first = disc_at(20, 15)
+    second = disc_at(20, 27)
+    values = (9.0 * (first | second)).astype(np.float32)
+    scores = (20.0 * first + beside * second).astype(np.float32)
+    scores[20, 21] = 22.0
+    is_known = np.ones(values.shape, bool)
+    assert len(_cores(scores, np.full(values.shape, 3.2), values, is_known)) == count
+
+
+def test_less_noise_finds_no_fewer_of_holes_that_stand_close() -> None:
+    """Templates peak between holes that stand close, the higher, the less noise there is: these
+    peaks must not hide the holes, which would then pass for scatter of the scores."""
+    disc = hole(60, 45, 1.2, 0.03)[35:56, 50:71]
+    depth_m = np.zeros(SHAPE)
+    for row in range(20, 70, 9):
+        for column in range(20, 100, 9):
+            depth_m[row - 10 : row + 11, column - 10 : column + 11] += disc
+    hole_free = [cloud_of(3e-4 * blurred(seed)) for seed in range(40, 44)]
+    detector = DETECTOR.calibrated(DETECTOR.calibrate(hole_free))
+    for noise_m in (5e-4, 2e-4, 1e-4):
+        cloud = cloud_of(depth_m + noise_m * blurred(7))
+        assert len(detector.find(cloud, detector.analyse(cloud), 5.5)) == 54
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 33.75, 45.0])

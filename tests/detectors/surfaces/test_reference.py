@@ -40,7 +40,7 @@ def seen(path: Path, T_camera_part: np.ndarray, noise_mm: float, dent_mm: float 
     """A cloud of the casting, with a round dent in its plain face at (0, 15) mm, 16 mm wide."""
     import open3d as o3d
 
-    corners, _ = front_of(ReferenceConfig(file=str(path)))
+    corners = front_of(ReferenceConfig(file=str(path))).corners_m
     scene = o3d.t.geometry.RaycastingScene()
     moved = transform_points(T_camera_part, corners.reshape(-1, 3)).astype(np.float32)
     faces = np.arange(len(moved), dtype=np.uint32).reshape(-1, 3)
@@ -98,14 +98,14 @@ def test_a_part_is_found_where_it_lies(
     cloud = seen(path, T, 0.5, dent_mm=3.0)
     true = seen(path, T, 0.0)
     points = cloud.points_m[cloud.valid]
-    note, surface = laid_on(points, reference, central=True)
-    off_m = np.abs(surface(points) - true.points_m[cloud.valid][:, 2])
+    surface = laid_on(points, reference, central=True)
+    off_m = np.abs(surface.z_at(points) - true.points_m[cloud.valid][:, 2])
     assert np.isnan(off_m).mean() < 0.25  # along outline, steps and edges
     assert np.nanmedian(off_m) < 0.05 * MM  # a tenth of the noise of a pixel
     assert np.nanquantile(off_m, 0.95) < 0.1 * MM
-    assert "casting.stl" in note
-    _, level = laid_on(points, reference, central=False)  # of a map, along z
-    noise_m = np.nanmedian(np.abs(level(points) - points[:, 2])) / 0.6745
+    assert "casting.stl" in surface.text
+    level = laid_on(points, reference, central=False)  # of a map, along z
+    noise_m = np.nanmedian(np.abs(level.z_at(points) - points[:, 2])) / 0.6745
     assert noise_m == pytest.approx(0.5 * MM, rel=0.15)
 
 
@@ -144,6 +144,25 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
         front_of(ReferenceConfig(file=str(away)))
     with pytest.raises(UserError, match="cannot be read"):
         front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))
+
+
+def test_a_wrong_unit_and_a_wrong_part_are_told(tmp_path: Path) -> None:
+    path = casting(tmp_path / "casting.stl")
+    cloud = seen(path, stood((6, -8, 3)), 0.5)
+    points = cloud.points_m[cloud.valid]
+    metres = tmp_path / "metres.stl"
+    trimesh.load(path).apply_scale(1e-3).export(metres)
+    with pytest.raises(
+        UserError, match=r"is 0\.\d+ mm large in mm, and the target 2\d\d mm"
+    ) as told:
+        laid_on(points, ReferenceConfig(file=str(metres)), central=True)
+    assert told.value.fix == "state its unit, if it is m: surface.reference.unit=m"
+    with pytest.raises(UserError, match="mm large in m, and the target"):
+        laid_on(points, ReferenceConfig(file=str(path), unit="m"), central=True)
+    ball = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(3, 110.0).export(ball)
+    with pytest.raises(UserError, match="is not this part: "):
+        laid_on(points, ReferenceConfig(file=str(ball)), central=True)
 
 
 def test_a_reference_is_stated_on_the_command_line(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import pytest
 
 from detectors.interface import Detection, Evidence, Measurement
 from harness import detect
+from harness.report.blocks import split_answer
 from harness.report.findings import Judged, Remark
 from harness.report.inspection_page import (
     best_view,
@@ -141,7 +142,8 @@ def test_every_number_of_the_page_stands_in_a_data_file(tmp_path: Path) -> None:
     with (out / "findings.csv").open(newline="") as stream:
         (row,) = csv.DictReader(stream)
     verdict = facts["verdict"]
-    assert f'<p class="answer">{verdict["sentence"]}</p>' in page
+    headline, further = split_answer(verdict["sentence"])
+    assert f'<p class="answer">{headline}</p>\n<p>{further}</p>' in page
     assert "<b>plate" not in page and "&lt;b&gt;plate" in page
     head, _, rest = page.partition("<main>")
     assert verdict["sentence"].startswith("One hole found on ")

@@ -3,8 +3,10 @@ same every time."""
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -18,6 +20,7 @@ from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
 from harness.vocabulary.text import size, text_of, unbroken
 from tests.harness.tables.test_study_limits_text import example
+from tests.support.pages import first_words
 from tests.support.synthetic_study import SetUp, Study, study_record, study_tables
 
 PROVENANCE = {
@@ -31,6 +34,7 @@ PROVENANCE = {
 YAML = "name: limits # <few> & many\n"
 SECTIONS = [
     "Detection limits",
+    "Probability of detection",
     "Limits against each axis",
     "Size and depth",
     "False calls and chance hits",
@@ -127,6 +131,8 @@ def structure(page: str) -> Structure:
 def test_every_section_is_there(page: str) -> None:
     assert headings(page) == SECTIONS
     for name in (
+        "limits",
+        "sight",
         "overlay",
         "axis-1",
         "axis-2",
@@ -151,9 +157,26 @@ def test_nothing_comes_from_outside(structure: Structure) -> None:
 def test_every_figure_has_words_for_those_who_cannot_see(
     structure: Structure, whole: StudyResult
 ) -> None:
-    assert len(structure.labels) == 7
+    assert len(structure.labels) == 9
     assert all(len(label) > 40 for label in structure.labels)
     assert not [label for label in structure.labels if "nan" in label.split()]
+
+
+def test_the_first_figure_shows_each_interval_of_a90_in_a_row_of_its_own(
+    whole: StudyResult, page: str
+) -> None:
+    (figure,) = re.findall(r'<figure id="limits">.*?</figure>', page, re.DOTALL)
+    (values,) = re.findall(r'data-values="([^"]+)"', figure)
+    (panel,) = json.loads(unescape(values))
+    rows = {name: (at[2], at[6], at[3]) for name, *at in panel["lines"]}
+    expected = {
+        limit.record.label: (limit.a90_interval_mm.low, limit.a90_interval_mm.high, row)
+        for row, limit in enumerate(whole.limits)
+    }
+    assert rows.keys() == expected.keys()
+    for name, (low_mm, high_mm, row) in expected.items():
+        ends_mm = (low_mm, min(high_mm, whole.limits[row].largest_mm), row)
+        assert rows[name] == pytest.approx(ends_mm, rel=1e-3)
 
 
 def test_the_users_words_are_escaped(page: str) -> None:
@@ -177,9 +200,8 @@ def test_the_limits_stand_in_their_table(whole: StudyResult, page: str) -> None:
         assert f"{size(limit.a90_95.value)} " in rows
         assert f"{limit.hits} of {limit.inspections}" in rows
     best = min(whole.limits, key=lambda limit: limit.a90_95.value)
-    answer = re.search(r'class="answer">(.*?)</p>', page)
-    assert answer is not None
-    assert f"(a90/95): {size(best.a90_95.value)}\u00a0mm" in answer[1]
+    headline = first_words(page)[0]
+    assert f"(a90/95): {size(best.a90_95.value)}\u00a0mm" in headline
     assert "within 15 mm of its own" in words(page)
 
 
@@ -301,10 +323,8 @@ def test_no_number_on_the_page_lies_beyond_the_sizes_inspected(beyond: StudyResu
     page = html(beyond, (example(where="at"),))
     largest = beyond.limits[0].largest_mm
     assert all(limit.beyond(limit.a90_95.value) for limit in beyond.limits)
-    answer = re.search(r'class="answer">(.*?)</p>', page)
-    assert answer is not None
     assert (
-        answer[1]
+        " ".join(first_words(page))
         .replace("\u00a0", " ")
         .count(f"no limit (a90/95) within the sizes inspected (1 to {largest:.3g}")
         == 3

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -18,6 +16,7 @@ from harness.report.view3d import (
     view3d_html,
     write_view3d,
 )
+from tests.support.browser import opened
 from tests.support.synthetic_perspectives import map_example
 
 
@@ -118,41 +117,17 @@ document.body.dataset.said = said.join(" ");
 </script></body>"""
 
 
-def browsed(path, *options: str) -> str:
-    """The page's elements after its scripts have run, in a browser without a window; skips where
-    there is none."""
-    browser = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
-    if browser is None:
-        pytest.skip("no Chromium to turn the cloud in")
-    command = [
-        browser,
-        "--headless",
-        "--no-sandbox",
-        "--disable-background-networking",
-        "--window-size=900,600",
-    ]
-    command += [
-        f"--user-data-dir={path.parent / 'profile'}",
-        *options,
-        "--virtual-time-budget=2000",
-        "--dump-dom",
-    ]
-    done = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=120)
-    if done.returncode or "</html>" not in done.stdout:
-        pytest.skip(f"Chromium does not run here: {done.stderr[-200:]}")
-    return done.stdout
-
-
 def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
     page = view3d_html(map_example(2, points=2000).scene, "T").replace("</body>", DRAG)
     path = tmp_path / "turn.html"
     path.write_text(page)
-    shown = browsed(
-        path, "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
+    shown = opened(
+        path,
+        path.parent,
+        "--window-size=900,600",
+        "--use-gl=angle",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
     )
     if "data-said" not in shown:
         assert 'style="display: block;"' in shown  # it says what is missing ...
@@ -169,5 +144,5 @@ def test_a_browser_turns_the_cloud_when_it_is_dragged(tmp_path):
 
 def test_a_browser_without_webgl_says_so(tmp_path):
     path = write_view3d(tmp_path / "flat.html", map_example(2, points=500).scene, "T")
-    shown = browsed(path, "--disable-gpu", "--disable-3d-apis")
+    shown = opened(path, path.parent, "--window-size=900,600", "--disable-gpu", "--disable-3d-apis")
     assert re.search(r'<p id="missing" role="alert" style="display: block;">', shown)

@@ -25,6 +25,7 @@ from harness.tables.study import set_by, threshold_warnings
 from harness.testing import check_detector, learns_plain_arrays
 from harness.testing.synthetic_clouds import plane
 from harness.trials.learning import LEARNING_BOARDS
+from harness.vocabulary.errors import UserError
 from tests.support.learning_detector import LearningDetector
 from tests.support.serial_run import records_of, run_serially, trial_keys
 
@@ -195,6 +196,25 @@ def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_
         for one in (group, additional)
     ]
     assert keys[0] < keys[1], "a further unit leaves the trials of the others as they were"
+
+
+def test_one_unit_may_calibrate_for_others(study_out: Path, tmp_path: Path) -> None:
+    changes = (UNITS, "study.one_unit_calibrates=true", LEARNING)
+    group = group_in(study_out, tmp_path, *changes)
+    own_seed = group.points[0].config.simulated.camera.unit_seed
+    at_5 = {point.digest: 5.0 for point in group.points}
+    seeds: dict[str, set[int]] = {}
+    for batch in group.batches:
+        for _, task in group.trials(batch, None if batch.role == "learning" else at_5):
+            found = {view.camera.unit_seed for view in task.views}
+            seeds[batch.role] = seeds.get(batch.role, set()) | found
+    assert seeds["learning"] == {own_seed}
+    assert seeds["calibration"] == {own_seed}
+    boards = [batch for batch in group.then if batch.role == "hole_free"]
+    assert len(seeds["hole_free"]) == len(boards)
+    assert own_seed not in seeds["hole_free"] | seeds["damaged"]
+    with pytest.raises(UserError, match="`one_unit_calibrates` needs `units`"):
+        plan_in(study_out, tmp_path, "study.one_unit_calibrates=true")
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from harness.tables.limits import (
     limit_notes,
     limit_sentence,
     notes_of,
+    short_names,
     study_answer,
 )
 from harness.tables.study import axis_grid, axis_groups
@@ -82,6 +83,15 @@ def test_one_sentence_for_each_set_up(two: list[SetUpLimit]) -> None:
     assert study_answer(two) == f"One unit of the camera: {limit_sentence(two[0])} {second}"
 
 
+def test_a_short_name_leaves_out_ranges_of_sizes_unless_set_ups_differ_in_them() -> None:
+    variants = ("blind, diameter 2 to 9 mm, depth 6 mm, thesis", "through, diameter 2 to 8 mm")
+    names = short_names(limits_of(*(SetUp(variant=variant) for variant in variants)))
+    assert list(names.values()) == ["blind, thesis, 1 frame", "through, 1 frame"]
+    variants = ("blind, depth 6 mm", "blind, depth 3 mm")
+    names = short_names(limits_of(*(SetUp(variant=variant) for variant in variants)))
+    assert names == {label: label for label in names}
+
+
 def test_of_many_set_ups_the_span_and_those_without_a_limit(
     two: list[SetUpLimit], nothing_found: SetUpLimit
 ) -> None:
@@ -89,7 +99,7 @@ def test_of_many_set_ups_the_span_and_those_without_a_limit(
     smallest = f"{size(two[1].a90_95.value)} mm (50 frames)"
     largest = f"{size(two[0].a90_95.value)} mm (1 frame)"
     assert answer == (
-        f"One unit of the camera: found nine times out of ten (a90/95): {smallest} to {largest};"
+        f"Nine in ten found by one unit (a90/95): {smallest} to {largest};"
         " 1 of 5 set-ups demonstrates no limit within the sizes inspected."
     )
     none = (

@@ -77,7 +77,7 @@ def test_the_window_leaves_a_third_of_the_noise():
     before = []
     after = []
     for _ in range(40):
-        unit, amplitude, _ = imager.phasors(exposure, rng)
+        unit, amplitude, _ = imager.reading(exposure, rng)
         filtered, _ = imager.filter(unit, amplitude, exposure.shape)
         phasor = (unit[0] + 1j * unit[1]).reshape(light.shape)
         before.append(np.angle(phasor * light))

@@ -1,4 +1,4 @@
-"""What a unit's frames share, what moves them, and their sums."""
+"""What a unit's frames share, and what moves them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.closed_form import plane_view
 from scenes.sensor.camera import load_camera
 from scenes.sensor.common.config import NO_EFFECTS, CameraConfig, EffectsConfig
 from scenes.sensor.common.facts import UnitFacts
-from scenes.sensor.common.unit import FrameTotals, frame_errors_m, light_of, rays_of, taps_of
+from scenes.sensor.common.unit import frame_errors_m, light_of, rays_of, taps_of
 from scenes.sensor.source import SimulatedUnit
 
 ONLY_JUMPS = NO_EFFECTS.model_copy(update={"frame_jumps": True})
@@ -107,28 +107,6 @@ def test_light_without_multipath_is_the_direct_light():
     all_phasor, all_intensity = light_of(view, EffectsConfig())
     assert all_phasor is view.phasor
     assert all_intensity is view.intensity
-
-
-def test_a_part_of_sums_is_theirs_on_those_pixels():
-    images = np.arange(5 * 12.0).reshape(5, 3, 4)
-    sums = FrameTotals(
-        frames=7,
-        step_m=0.001,
-        base=images[0],
-        count=images[1],
-        total=images[2],
-        squares=images[3],
-        amplitude=images[4],
-        reasons=images,
-    )
-    part = sums.cut((slice(1, 3), slice(0, 2)))
-    assert (part.frames, part.step_m) == (7, 0.001)
-    assert part.reasons.tolist() == images[:, 1:3, 0:2].tolist()
-    assert part.base.tolist() == images[0, 1:3, 0:2].tolist()
-    assert part.count.tolist() == images[1, 1:3, 0:2].tolist()
-    assert part.total.tolist() == images[2, 1:3, 0:2].tolist()
-    assert part.squares.tolist() == images[3, 1:3, 0:2].tolist()
-    assert part.amplitude.tolist() == images[4, 1:3, 0:2].tolist()
 
 
 def test_a_unit_leaves_out_the_margin_but_at_the_sensors_border():

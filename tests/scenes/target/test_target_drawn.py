@@ -246,6 +246,35 @@ def test_sizes_are_uniform_and_each_board_has_one_of_each_part(law: str) -> None
     assert stats.spearmanr(within[:, 0], within[:, 1]).pvalue > ALPHA
 
 
+def test_chosen_sizes_replace_those_that_would_be_drawn_and_nothing_else() -> None:
+    chosen_mm = (2.5, 3.0, 3.0, 4.25, 5.0, 5.5, 8.0, 12.0)
+    for damage in (THROUGH, BLIND):
+        drawn = family(damage=damage).drawn("damaged", 3)
+        chosen = family(damage=damage).drawn("damaged", 3, chosen_mm)
+        assert tuple(hole.diameter_mm for hole in chosen.holes) == chosen_mm
+        assert [hole.depth_mm for hole in chosen.holes] == [hole.depth_mm for hole in drawn.holes]
+        assert places(chosen) == places(drawn)
+        assert chosen.pose == drawn.pose
+        assert chosen.material == drawn.material
+
+
+def test_chosen_sizes_are_depths_if_only_depths_vary() -> None:
+    chosen_mm = (1.0, 1.5, 2.0, 2.0, 4.0, 5.0, 6.0, 9.0)
+    one_diameter = family(damage={**BLIND, "diameter_mm": [10.0, 10.0]})
+    assert one_diameter.damage.limit_of == "depth"
+    assert one_diameter.damage.limit_range_mm == (1.0, 9.0)
+    chosen = one_diameter.drawn("damaged", 3, chosen_mm)
+    assert [hole.depth_mm for hole in chosen.holes] == pytest.approx(chosen_mm)
+    assert {hole.diameter_mm for hole in chosen.holes} == {10.0}
+    # a dent is no deeper than its radius
+    dents = family(damage={**DENT, "diameter_mm": [4.0, 4.0]})
+    depths_mm = [
+        dent.depth_mm for dent in dents.drawn("damaged", 0, (0.5, 1, 1, 1, 1, 1, 2, 3)).dents
+    ]
+    assert depths_mm == pytest.approx([0.5, 1, 1, 1, 1, 1, 2, 2])
+    assert family().damage.limit_of == "diameter"
+
+
 def test_pose_and_depth_are_uniform() -> None:
     drawn = family(damage=BLIND)
     boards = [drawn.drawn("hole_free", n) for n in range(200)]

@@ -17,6 +17,7 @@ from harness.evaluation.study.boards import (
     design_effect,
     refitted_sizes,
     targets_of,
+    units_effect,
     weights_in_blocks,
 )
 from harness.evaluation.study.limit import limit_of
@@ -160,6 +161,31 @@ def test_a_limit_over_boards_is_wider_by_a_tenth_where_boards_matter() -> None:
     assert matters(1.11, 2.0)
     assert not matters(1.09, 2.0)
     assert not matters(1.11, np.nan)
+
+
+def test_the_effect_of_units_is_one_plus_what_they_add_to_the_boards_variance() -> None:
+    """Four units, of which each finds half as much as the next; no combination of board and unit
+    has two damages, so that its influences are the rows'."""
+    random = np.random.default_rng(6)
+    board = np.repeat(np.arange(30), 4)
+    unit = np.tile(np.arange(4), 30)
+    size_mm = np.repeat(random.uniform(1.0, 11.0, 30), 4)
+    hit = random.random(120) < CURVE.pod(size_mm + 0.8 * (unit - 1.5))
+    rows = Targets(
+        board=board, size_mm=size_mm, hits=hit.astype(float), inspections=np.ones(120), unit=unit
+    )
+    # by hand, for a logit curve of sizes
+    chance = CURVE.pod(size_mm)
+    design = np.column_stack([np.ones(120), size_mm])
+    information = design.T @ ((chance * (1 - chance))[:, None] * design)
+    at_half = np.array([1.0, CURVE.size_at(0.5)])
+    influence = design @ np.linalg.solve(information, at_half) * (hit - chance)
+    of_boards = (influence.reshape(30, 4).sum(axis=1) ** 2).sum() * 30 / 29
+    of_units = (influence.reshape(30, 4).sum(axis=0) ** 2).sum() * 4 / 3
+    of_rows = (influence**2).sum() * 120 / 119
+    expected = 1 + (of_units - of_rows) / of_boards
+    assert expected > 1.5
+    assert units_effect(rows, CURVE, 0.5) == pytest.approx(expected, rel=1e-9)
 
 
 def test_draws_below_zero_are_zero() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from harness.evaluation.intervals import percentiles
 from harness.evaluation.pod.averaged import ModelAverage
+from harness.evaluation.pod.clustered import ClusterAverage
 from harness.evaluation.pod.curve import CELLS, LINKS, PodCurve
 from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss
 from harness.evaluation.study.boards import (
@@ -415,15 +416,18 @@ class TestBoardsDrawnAgain:
             spreads.append(refitted_sizes(targets, curve, (0.9,), 100)[0].std())
         assert np.mean(spreads) == pytest.approx(np.std(estimates), rel=0.25)
 
-    def test_the_bound_over_boards_divides_the_log_likelihoods_by_the_effect(self):
-        limit = limit_of(set_up(Study((SetUp(boards_mm=3.0),), boards=30)))
+    def test_bound_over_boards_and_intervals_are_of_curves_shifted_from_board_to_board(self):
+        limit = limit_of(set_up(Study((SetUp(boards_mm=3.0),), boards=30)), draws=20)
         inspected = limit.record.inspected
         targets = targets_of(inspected.board, inspected.hole, inspected.diameter_mm, inspected.hit)
         effect = design_effect(targets, limit.statement.curve, 0.9)
         assert effect == limit.design_effect > 1.3
-        assert limit.over_boards == ModelAverage(limit.statement.fits, effect).bound()
+        clustered = ClusterAverage(limit.statement.average, inspected.board)
+        assert limit.over_boards == clustered.bound()
         assert limit.over_boards.value > limit.a90_95.value
-        calm = limit_of(set_up(Study(boards=30, hole_free_boards=0, seed=3)))
+        assert limit.a50_interval_mm == clustered.interval(0.5)
+        assert limit.a90_interval_mm == clustered.interval(0.9)
+        calm = limit_of(set_up(Study(boards=30, hole_free_boards=0, seed=3)), draws=20)
         assert calm.design_effect <= 1
         assert calm.over_boards.value == pytest.approx(calm.a90_95.value, rel=0.02)
 

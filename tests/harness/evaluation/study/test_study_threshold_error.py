@@ -44,6 +44,18 @@ def targets(hit: list[float], excess: list[float]) -> Targets:
     )
 
 
+def rows_of(record: SetUpRecord) -> Targets:
+    """The inspections as rows, each with its signal above the threshold."""
+    inspected = record.inspected
+    return Targets(
+        board=inspected.board,
+        size_mm=inspected.diameter_mm,
+        hits=inspected.hit.astype(float),
+        inspections=np.ones(len(inspected.hit)),
+        excess=(inspected.signal - THRESHOLD) / ERROR,
+    )
+
+
 def test_a_higher_threshold_loses_hits_and_a_lower_one_gains_some() -> None:
     """A signal above the threshold that was no hit (the fourth) stays none."""
     rows = targets([0, 1, 1, 0, 1], [-0.5, 0.5, 1.5, 2.0, np.inf])
@@ -61,14 +73,7 @@ def test_a_higher_threshold_loses_hits_and_a_lower_one_gains_some() -> None:
 def test_the_size_grows_by_the_errors_share_of_the_signals_slope() -> None:
     """Signals grow by 0.8 per mm: an error of 0.6 is 0.75 mm of a90."""
     record = at(THRESHOLD, ERROR, boards=60)
-    inspected = record.inspected
-    rows = Targets(
-        board=inspected.board,
-        size_mm=inspected.diameter_mm,
-        hits=inspected.hit.astype(float),
-        inspections=np.ones(len(inspected.hit)),
-        excess=(inspected.signal - THRESHOLD) / ERROR,
-    )
+    rows = rows_of(record)
     curve = PodCurve("logit", False, 6.0, 0.8, np.zeros((2, 2)))
     expected = ERROR / SIGNAL_PER_MM / SetUp().a90_mm
     assert size_per_error(rows, curve, 0.9) == pytest.approx(expected, rel=0.25)
@@ -81,8 +86,16 @@ def test_interval_and_bound_contain_the_thresholds_error() -> None:
     with_error = limit_of(at(THRESHOLD, ERROR), draws=200)
     assert small.a90_draws_mm == pytest.approx(without.a90_draws_mm)
     assert small.a90_95.value == pytest.approx(without.a90_95.value, rel=1e-6)
-    width = without.a90_interval_mm.high - without.a90_interval_mm.low
-    assert with_error.a90_interval_mm.high - with_error.a90_interval_mm.low > 1.4 * width
+    margin = 1.96 * size_per_error(rows_of(at(THRESHOLD, ERROR)), with_error.statement.curve, 0.9)
+    below = np.log(without.a90_mm / without.a90_interval_mm.low)
+    above = np.log(without.a90_interval_mm.high / without.a90_mm)
+    assert 0.10 < margin < 0.25  # 1.96 times 0.75 of 7.76 mm is 0.19
+    assert with_error.a90_interval_mm.low == pytest.approx(
+        without.a90_mm * np.exp(-np.hypot(below, margin)), rel=1e-4
+    )
+    assert with_error.a90_interval_mm.high == pytest.approx(
+        without.a90_mm * np.exp(np.hypot(above, margin)), rel=1e-4
+    )
     assert with_error.a90_95.value > 1.02 * without.a90_95.value
     assert with_error.over_boards.value > 1.02 * without.over_boards.value
     assert with_error.a90_mm == without.a90_mm

@@ -76,7 +76,7 @@ def test_without_a_limit_over_boards_there_is_none_of_a_new_unit() -> None:
 
 
 def test_a_study_of_several_units_is_judged_by_unit() -> None:
-    """Repeat r shows unit r modulo 3; percentiles resample units as well as boards."""
+    """Repeat r shows unit r modulo 3; draws and interval contain units as well as boards."""
     record = study_record(Study(boards=15, hole_free_boards=0, repeats=3)).set_ups[0]
     single_unit = limit_of(record, draws=60)
     limit = limit_of(replace(record, units=3), draws=60)
@@ -95,4 +95,6 @@ def test_a_study_of_several_units_is_judged_by_unit() -> None:
         assert limit.over_units.a90_mm[unit] == pytest.approx(fit.curve.size_at(0.9), rel=1e-9)
     assert limit.a90_95 == single_unit.a90_95
     assert limit.over_units.new_unit.value > limit.over_boards.value
+    assert limit.a90_interval_mm.low <= single_unit.a90_interval_mm.low
+    assert limit.a90_interval_mm.high >= single_unit.a90_interval_mm.high
     assert not np.array_equal(limit.a90_draws_mm, single_unit.a90_draws_mm)

@@ -12,12 +12,16 @@ import pytest
 from harness import api
 from harness.evaluation.intervals import Interval
 from harness.evaluation.study.limit import limit_of
+from harness.experiment.checks import LEAST_BOARDS
 from harness.experiment.load import load_experiment
-from harness.programs.audit import boards, studies
+from harness.programs.audit import boards, precise_studies, studies
 from harness.programs.audit.audit import BOARDS, main, rows_of_simulated
 from harness.programs.audit.page import headline
+from harness.programs.audit.precise_studies import PreciseCase, claims_of_precise_study
 from harness.programs.audit.rows import audited
 from harness.programs.audit.studies import STUDY_CASES, StudyCase, claims_of_study
+
+SHORT = (PreciseCase(StudyCase("steep", 0.2), 5.0),)
 
 
 def test_the_true_sizes_are_those_of_a_board_drawn_at_random() -> None:
@@ -47,7 +51,7 @@ def test_scores_of_hole_free_boards_have_the_stated_law(law: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(studies, "threshold_from_peaks", kept)
         for _ in range(20):
-            studies._threshold(case, random)
+            studies.drawn_threshold(case, random)
     peaks = np.concatenate(seen)
     assert peaks.shape == (1200, 10)
     assert (np.diff(peaks, axis=1) < 0).all()
@@ -67,6 +71,18 @@ def test_a_study_claims_all_quantities_and_the_same_again() -> None:
     }
     assert claims == claims_of_study(STUDY_CASES[1], 0)
     assert claims != claims_of_study(STUDY_CASES[1], 1)
+
+
+def test_a_precise_study_is_the_same_again_and_ends_when_it_is_precise() -> None:
+    *claims, reached = claims_of_precise_study(SHORT[0], 0)
+    assert claims == claims_of_precise_study(SHORT[0], 0)[:-1]
+    assert claims != claims_of_precise_study(SHORT[0], 1)[:-1]
+    assert (reached.holds, reached.ratio) == (True, LEAST_BOARDS)
+    never = PreciseCase(StudyCase("steep", 0.2, holes=2), 1e-6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(precise_studies, "MOST_BOARDS", 12)
+        reached = claims_of_precise_study(never, 0)[-1]
+    assert (reached.holds, reached.ratio) == (False, 12)
 
 
 def test_claims_hold_where_the_truth_lies_within() -> None:
@@ -119,7 +135,7 @@ def test_counted_false_calls_agree_where_the_intervals_overlap() -> None:
     """Garwood: 5 calls on 3.24 m2 are 0.50 to 3.60 per m2, 15 are 2.59 to 7.64."""
     limits = []
     for number in (5, 15):
-        claimed = studies._threshold(STUDY_CASES[1], np.random.default_rng(1))
+        claimed = studies.drawn_threshold(STUDY_CASES[1], np.random.default_rng(1))
         record = studies._record(STUDY_CASES[1], claimed, np.random.default_rng(1))
         assert record.threshold_error is not None
         stated = replace(record.threshold_error, low_per_m2=0.4, high_per_m2=1.8)
@@ -137,11 +153,15 @@ def test_the_program_writes_page_and_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(studies, "STUDY_CASES", STUDY_CASES[3:4])
+    monkeypatch.setattr(precise_studies, "PRECISE_CASES", SHORT)
     options = ["--no-boards", "--studies", "3", "--jobs", "1", "--out", str(tmp_path)]
     assert main(options) == 0
     assert "statements" in capsys.readouterr().out
     table = api.table(tmp_path, "audit")
-    assert set(table["case"]) == {"20 targets"}
+    assert set(table["case"]) == {"20 targets", "steep, a90 to 5 mm"}
+    reached = table[table["quantity"] == "precision reached"].iloc[0]
+    assert (reached["held"], reached["ratio"]) == (3, LEAST_BOARDS)
+    assert reached["verdict"] == "no coverage"
     assert (table["stated"] == 3).all()
     assert "median ratio" in (tmp_path / "audit.html").read_text()
     assert (tmp_path / "audit.csv").is_file()
@@ -149,6 +169,7 @@ def test_the_program_writes_page_and_table(
 
 def test_two_processes_judge_as_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(studies, "STUDY_CASES", STUDY_CASES[3:4])
+    monkeypatch.setattr(precise_studies, "PRECISE_CASES", ())
     assert rows_of_simulated(2, jobs=2) == rows_of_simulated(2, jobs=1)
 
 

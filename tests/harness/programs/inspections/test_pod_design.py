@@ -10,8 +10,9 @@ from harness.evaluation.intervals import (
     false_call_rate,
     threshold_for_rate,
 )
+from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.curve import LINKS, PodCurve
-from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
+from harness.evaluation.pod.hit_miss import choose_model, near_models
 from harness.programs.inspections.design_statistics import (
     StudyPlan,
     curve_through,
@@ -130,7 +131,7 @@ def test_the_plan_is_that_of_its_simulated_studies() -> None:
     luck = random_stream(3, "pod design", 40, "uniform").random((20, 40))
     bounds = []
     for hits in luck < guess.pod(sizes):
-        bounds.append(bound(fit_hit_miss(sizes, hits), 0.9, 0.95).value)
+        bounds.append(ModelAverage(near_models(choose_model(sizes, hits))).bound().value)
     ordered = np.sort(bounds)
     assert (plan.low, plan.bound, plan.high) == pytest.approx(tuple(ordered[[1, 9, 17]]))
     assert plan.demonstrated == np.isfinite(bounds).mean()

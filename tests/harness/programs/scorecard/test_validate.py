@@ -209,7 +209,7 @@ def test_a_check_of_the_code_passes_within_its_tolerance_only_and_is_counted_apa
         [score]
     )
     answer = program._answer([Score(check, Reading(0.9)), Score(reality, Reading(0.4))])
-    assert answer.startswith("0 of 1 blind figures pass: ")
+    assert answer.startswith("0 of 1 blind figures pass; ")
     assert "1 of 1 checks of the code pass. Failures without a stated reason: neighbours." in answer
 
 

@@ -240,7 +240,7 @@ def test_pixels_without_light_have_no_return():
 def test_the_margin_holds_the_gap_and_the_kernel():
     assert camera_with(edge__gap_px=3.0, edge__blur_px=2.0).optics.margin_px == 6 + 2 + 1
     unit = SimulatedUnit(camera_with(), QUIET, plane_view(camera_with(), REGION, 1.0, 0.5))
-    assert unit.at_once is None
+    assert unit.first_order is None
 
 
 # ---------------------------------------------------------------- the table for any simulator

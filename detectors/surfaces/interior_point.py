@@ -1,0 +1,112 @@
+"""Least absolute residuals by an interior point method (Portnoy and Koenker 1997, with Mehrotra's
+predictor and corrector 1992), for points of which a few lie many widths of the others away.
+
+Of n points and p terms, each step solves a weighted least-squares problem. Their number hardly
+depends on the points: 10 to 15 for a plain picture, 60 with stray points at 40 times the range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+MOST_STEPS = 200
+TO_BOUNDARY = 0.9995
+"""Share of the way to the boundary that a step may go."""
+TINY_M = 1e-9  # residuals below a nanometre are rounding errors
+
+
+@dataclass(frozen=True)
+class _State:
+    """Residuals r = above - below with both parts positive, and multipliers ("signs") in (-1, 1)
+    with basis signs = 0. At the solution above (1 - signs) = below (1 + signs) = 0."""
+
+    c: np.ndarray
+    """Coefficients (p,), metres."""
+    above: np.ndarray
+    """Part (n,) of the residuals above 0, metres."""
+    below: np.ndarray
+    """Part (n,) of the residuals below 0, metres."""
+    signs: np.ndarray
+    """Multipliers (n,): at the solution, the signs of the residuals."""
+
+    @property
+    def top(self) -> np.ndarray:
+        """Products (n,) that are 0 at the solution, as are those of `bottom`."""
+        return self.above * (1.0 - self.signs)
+
+    @property
+    def bottom(self) -> np.ndarray:
+        """Products (n,) of the other part."""
+        return self.below * (1.0 + self.signs)
+
+    def moved(self, step: _State) -> _State:
+        """Return the state after a step, cut short before the boundary: the residuals' part and
+        the multipliers' part each by itself."""
+        shrinks = min(
+            float((step.above / self.above).min()), float((step.below / self.below).min())
+        )
+        rises = float((step.signs / (1.0 - self.signs)).max())
+        falls = float((-step.signs / (1.0 + self.signs)).max())
+        share = min(1.0, TO_BOUNDARY / max(-shrinks, TINY_M))
+        signs_share = min(1.0, TO_BOUNDARY / max(rises, falls, TINY_M))
+        return _State(
+            c=self.c + share * step.c,
+            above=self.above + share * step.above,
+            below=self.below + share * step.below,
+            signs=self.signs + signs_share * step.signs,
+        )
+
+
+def least_absolute(
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    gap: float,
+) -> tuple[np.ndarray, float]:
+    """Return the coefficients c (p,) with the least sum of |z - c basis| of a basis (p, n), from a
+    ``start`` (p,), and by which share of itself that sum may exceed the least: ``gap``, unless
+    `MOST_STEPS` are too few."""
+    r = z - start @ basis
+    width = max(float(np.median(np.abs(r))), TINY_M)
+    above = np.maximum(r, 0.0) + width
+    state = _State(start, above, above - r, np.zeros(len(z)))
+    for _ in range(MOST_STEPS):
+        r = z - state.c @ basis
+        total = float(np.abs(r).sum())
+        reached = (total - float(r @ state.signs)) / max(total, TINY_M * len(z))
+        if reached <= gap:
+            break
+        state = _stepped(state, r, basis)
+    return state.c, reached
+
+
+def _stepped(state: _State, r: np.ndarray, basis: np.ndarray) -> _State:
+    """Return the state after a step towards products that are smaller and equal: how much smaller
+    is seen from a step towards 0."""
+    weight = 1.0 / (state.above / (1.0 - state.signs) + state.below / (1.0 + state.signs))
+    weighted = basis * weight
+    gram = weighted @ basis.T
+
+    def towards(top: np.ndarray, bottom: np.ndarray) -> _State:
+        """Return the step that leads to these products, to first order."""
+        pull = r - top / (1.0 - state.signs) + bottom / (1.0 + state.signs)
+        c_step = np.linalg.solve(gram, weighted @ pull)
+        signs_step = weight * (pull - c_step @ basis)
+        return _State(
+            c=c_step,
+            above=(top + state.above * signs_step) / (1.0 - state.signs) - state.above,
+            below=(bottom - state.below * signs_step) / (1.0 + state.signs) - state.below,
+            signs=signs_step,
+        )
+
+    nothing = np.zeros(len(r))
+    predicted = towards(nothing, nothing)
+    after = state.moved(predicted)
+    before_sum = float(state.top.sum() + state.bottom.sum())
+    after_sum = float(after.top.sum() + after.bottom.sum())
+    size = before_sum * (after_sum / before_sum) ** 3 / (2 * len(r))
+    # what the first order left out
+    top = size + predicted.above * predicted.signs
+    bottom = size - predicted.below * predicted.signs
+    return state.moved(towards(top, bottom))

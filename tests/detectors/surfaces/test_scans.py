@@ -1,0 +1,119 @@
+"""Captures as references: a part is placed on them, with errors as large as stated, and what is
+expected of it is the surface that was recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from detectors import load_detector
+from detectors.surfaces.expected import KnownPose
+from detectors.surfaces.scans import good_parts, laid_under, placed, scan_of
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.geometry import MM, invert, transform_points
+from tests.support import made_parts
+from tests.support.made_parts import MadePart, cloud_of, depth_m, pose
+
+TURNED = pose((4.0, -3.0, 5.0), (4.0, -3.0))
+EARLIER, EARLIER_MASK = cloud_of(MadePart(), pose(), seed=1)
+SCAN = scan_of(EARLIER, EARLIER_MASK, "earlier")
+T_EARLIER_NOW = pose() @ invert(TURNED)
+
+
+def test_a_part_is_placed_within_the_stated_error() -> None:
+    cloud, mask = cloud_of(MadePart(), TURNED, seed=2)
+    found = placed(SCAN, cloud.points_m[mask], 1.0, True, None)
+    middle_m = transform_points(invert(T_EARLIER_NOW), found.middle_m)
+    error_m = transform_points(found.T_part_camera, middle_m) - found.middle_m
+    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    assert (np.abs(error_m) < 4 * stated_m).all()
+    # a hundredth of a pixel along the plate, less than a tenth of the noise across it
+    assert (stated_m[:2] < 0.02 * MM).all() and stated_m[2] < 0.004 * MM
+    assert (stated_m > 0.001 * MM).all()
+
+
+def test_a_part_upside_down_is_found() -> None:
+    cloud, mask = cloud_of(MadePart(), pose((2.0, 1.0, 178.0)), seed=2)
+    laid = laid_under(SCAN, cloud, mask)
+    assert laid.facts["median_off_mm"] < 0.15
+
+
+def test_what_is_expected_is_what_was_recorded() -> None:
+    cloud, mask = cloud_of(MadePart(), TURNED, seed=2)
+    laid = laid_under(SCAN, cloud, mask)
+    points_m = cloud.points_m[mask]
+    off_m = laid.z_at(points_m) - depth_m(MadePart(), TURNED)[mask]
+    spread_m = laid.spread_at(points_m)
+    assert np.nanmedian(spread_m) == pytest.approx(0.12 * MM, rel=0.15)
+    total_m = np.hypot(spread_m, laid.registration_at(points_m))
+    # between three corners, noise is less than theirs; walls of ribs are covered as well
+    assert 1.0 < np.nanquantile(np.abs(off_m / total_m), 0.95) < 2.0
+    assert np.nanmax(np.abs(off_m)) > 1.0 * MM
+    assert np.nanquantile(np.abs(off_m / total_m), 0.997) < 3.0
+
+
+def test_a_flat_plate_is_known_to_a_pixel_along_itself() -> None:
+    flat = MadePart(has_ribs=False)
+    earlier, mask = cloud_of(flat, pose(), seed=3)
+    cloud, now = cloud_of(flat, TURNED, seed=4)
+    found = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, None)
+    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    pixel_m = made_parts.DISTANCE_M / made_parts.LENS.fx
+    assert stated_m[:2] == pytest.approx([pixel_m] * 2, rel=0.2)
+    assert stated_m[2] < 0.005 * MM
+
+
+def test_marks_place_what_the_surface_does_not() -> None:
+    flat = MadePart(has_ribs=False)
+    earlier, mask = cloud_of(flat, pose(), seed=3)
+    cloud, now = cloud_of(flat, TURNED, seed=4)
+    covariance = np.diag([1e-3**2] * 3 + [(0.1 * MM) ** 2] * 3)
+    marks = KnownPose(T_EARLIER_NOW, covariance, earlier.points_m[mask].mean(axis=0))
+    found = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, marks)
+    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    assert stated_m[:2] == pytest.approx([0.1 * MM] * 2, rel=0.1)
+    assert stated_m[2] < 0.005 * MM  # by the surface
+    shift_m = (found.T_part_camera @ invert(T_EARLIER_NOW))[:3, 3]
+    assert np.abs(shift_m).max() < 0.2 * MM
+
+
+def test_good_parts_state_where_parts_differ() -> None:
+    rng = np.random.default_rng(5)
+    ribs_mm = rng.normal(0.0, 0.5, 8)
+    scans = []
+    for number, rib_mm in enumerate(ribs_mm):
+        T = pose(tuple(rng.uniform(-3, 3, 3)), tuple(rng.uniform(-3, 3, 2)))
+        cloud, mask = cloud_of(MadePart(rib_mm=rib_mm), T, seed=10 + number)
+        scans.append(scan_of(cloud, mask, f"part {number}"))
+    parts = good_parts(scans[0], [(scan, None) for scan in scans[1:]], central=True)
+    mean = parts.mean("the parts")
+    cloud, mask = cloud_of(MadePart(), pose(), seed=30)
+    laid = laid_under(mean, cloud, mask)
+    x_m, y_m = (cloud.points_m[mask] - pose()[:3, 3]).T[:2]
+    on_rib = (np.abs(x_m + 0.045) < 0.002) & (np.abs(y_m) < 0.025)
+    on_face = (np.abs(x_m - 0.0) < 0.015) & (np.abs(y_m) < 0.015)
+    spread_m = laid.spread_at(cloud.points_m[mask])
+    true_m = float(ribs_mm.std(ddof=1)) * MM
+    assert np.nanmedian(spread_m[on_rib]) == pytest.approx(true_m * np.sqrt(1 + 1 / 8), rel=0.2)
+    # the mean of eight averages, and less than one of them would have
+    assert 0.12 / np.sqrt(8) * 0.8 < np.nanmedian(spread_m[on_face]) / MM < 0.12
+    left_out = parts.mean("the others", left_out=0)
+    assert (mean.parts, left_out.parts) == (8, 7)
+
+
+def test_mistakes_are_told() -> None:
+    flat, mask = cloud_of(MadePart(has_ribs=False), pose(), seed=7)
+    arched, arched_mask = cloud_of(MadePart(has_ribs=False, bend_mm=20.0), pose(), seed=7)
+    with pytest.raises(UserError, match="is not this part: after the best placement 80 % of it"):
+        laid_under(SCAN, arched, arched_mask)
+    with pytest.raises(UserError, match="part 1: is not like earlier"):
+        arched_scan = scan_of(arched, arched_mask, "part 1")
+        good_parts(SCAN, [(arched_scan, None)], central=True)
+    corner = mask.copy()
+    corner[:, 75:] = False
+    corner[60:] = False
+    with pytest.raises(UserError, match=r"corner: shows \d+ % of the part"):
+        laid_under(scan_of(flat, corner, "corner"), flat, mask)
+    detector = load_detector("local", {"crop": {"kind": "none"}, "surface": {"shape": "expected"}})
+    with pytest.raises(UserError, match="the cloud has none"):
+        detector.analyse(flat)

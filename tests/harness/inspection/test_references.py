@@ -1,0 +1,138 @@
+"""A part compared with an earlier capture and with good parts, from files to findings."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from harness import detect
+from harness.inspection.arguments import is_mesh
+from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change
+from harness.inspection.references import captures_in
+from tests.harness.inspection.test_verdict import finding
+from tests.support.made_parts import Dent, MadePart, pose, write_capture
+
+THEN = MadePart((Dent(0, 0, 14, 1.0), Dent(20, -30, 12, 2.5), Dent(-15, -30, 12, 1.5)))
+NOW = MadePart((Dent(0, 0, 18, 2.5), Dent(20, -30, 12, 2.5), Dent(40, 10, 12, 1.5)))
+OPTIONS = ("--unit", "m", "--detector", "local")
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A part then and now, and four good parts that differ as made parts do."""
+    folder = tmp_path_factory.mktemp("captures")
+    write_capture(folder / "then", THEN, pose(), seed=1)
+    write_capture(folder / "now", NOW, pose((3.0, -2.0, 4.0), (4.0, -3.0)), seed=2)
+    for number in range(4):
+        part = MadePart(bend_mm=0.3 * (number - 2), rib_mm=0.15 * (number % 3 - 1))
+        T = pose((number - 2.0, 1.0, number), (number, -number))
+        write_capture(folder / "good" / f"part{number}", part, T, seed=10 + number)
+    return folder
+
+
+def inspected(folder: Path, reference: str, out: str) -> dict[str, Any]:
+    """The findings of the part now, against a reference."""
+    paths = [str(folder / "now"), "--reference", str(folder / reference)]
+    assert detect.main([*paths, *OPTIONS, "--out", str(folder / out)]) == 0
+    data: dict[str, Any] = json.loads((folder / out / "findings.json").read_text())
+    return data
+
+
+def test_damage_is_new_grown_or_gone(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = inspected(captures, "then", "changed")
+    change = data["change"]
+    assert [damage["state"] for damage in change["damage"]] == [GROWN, NEW, GONE]
+    grown, new, gone = change["damage"]
+    assert grown["then"]["diameter_mm"] == pytest.approx(14, abs=1.0)
+    assert grown["then"]["depth_mm"] == pytest.approx(1.0, abs=0.15)
+    assert grown["now"]["diameter_mm"] == pytest.approx(18, abs=1.0)
+    assert grown["now"]["depth_mm"] == pytest.approx(2.5, abs=0.25)
+    assert grown["distance_mm"] == pytest.approx(1.5, abs=0.1)
+    assert (new["then"], gone["now"]) == (None, None)
+    assert new["now"]["depth_mm"] == pytest.approx(1.5, abs=0.15)
+    assert gone["then"]["depth_mm"] == pytest.approx(1.5, abs=0.15)
+    # 20 pixels of .12 mm in each capture, and the placement
+    assert 0.05 < change["typical_level_of_detection_mm"] < 0.12
+    assert data["surface"]["reference"]["placed_by"] == "outline and surface"
+    assert "change: 1 new, 1 grown, 1 gone; changes over 11 mm are" in capsys.readouterr().out
+    with (captures / "changed" / "change.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    significant = np.array([row["significant"] == "1" for row in rows])
+    assert 0.02 < significant.mean() < 0.12  # three of its places changed
+    page = (captures / "changed" / "report.html").read_text()
+    assert "What changed" in page and "grown" in page
+
+
+def test_features_of_good_parts_are_no_findings(
+    captures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = inspected(captures, "good", "compared")
+    sure = [finding for finding in data["findings"] if finding["certainty"] == "sure"]
+    places = sorted((round(finding["x_mm"]), round(finding["y_mm"])) for finding in sure)
+    assert len(places) == 3
+    assert {finding["term"] for finding in sure} == {"dent"}
+    assert data["surface"]["reference"]["parts"] == 4
+    assert data["change"] is None
+    assert "on 4 good parts, each left out once" in capsys.readouterr().out
+
+
+def test_the_kind_of_a_reference_is_seen(captures: Path, tmp_path: Path) -> None:
+    assert captures_in(captures / "then") == ()
+    assert [path.name for path in captures_in(captures / "good")] == [
+        f"part{number}" for number in range(4)
+    ]
+    box = trimesh.creation.box((1, 1, 1))
+    box.export(tmp_path / "part.ply")
+    trimesh.PointCloud(box.vertices).export(tmp_path / "scan.ply")
+    assert is_mesh(tmp_path / "part.ply")
+    assert not is_mesh(tmp_path / "scan.ply")
+    assert is_mesh(tmp_path / "part.stl")
+
+
+def test_mistakes_are_told(captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    now = str(captures / "now")
+    flat = write_capture(captures / "arched", MadePart(has_ribs=False, bend_mm=20), pose(), seed=3)
+    for reference, message in (
+        (str(flat), "is not this part: after the best placement"),
+        (str(captures / "none"), "none"),
+    ):
+        assert detect.main([now, "--reference", reference, *OPTIONS]) == 2
+        assert message in capsys.readouterr().err
+    quiet = ["--reference", str(captures / "then"), "--quiet-capture", str(captures / "then")]
+    assert detect.main([now, *quiet, *OPTIONS]) == 2
+    assert "leave out --quiet-capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change_mm", "then_mm", "now_mm", "was_there", "state"),
+    [
+        (1.5, None, None, False, NEW),
+        (-1.5, None, None, True, GONE),
+        (1.5, 1.0, 2.5, False, GROWN),
+        (-1.5, 2.5, 1.0, True, SHRUNK),
+        (1.5, None, 2.5, False, GROWN),  # 1.0 mm is left of it then
+        (1.5, None, 1.6, False, NEW),
+        (-1.5, 1.6, None, True, GONE),
+        (1.0, -8.0, -8.1, False, NEW),  # a dent on a rib
+    ],
+)
+def test_states(
+    change_mm: float, then_mm: float | None, now_mm: float | None, was_there: bool, state: str
+) -> None:
+    def size(depth_mm: float | None) -> DamageSize | None:
+        return None if depth_mm is None else DamageSize(10.0, depth_mm, 0.1)
+
+    found = finding(depth_mm=change_mm, depth_se_mm=0.1, diameter_mm=10.0)
+    change = _change(
+        found, size(then_mm), size(now_mm), was_there=was_there, distance_m=1e-3, lod_m=1e-4
+    )
+    assert change.state == state
+    if change_mm == 1.5 and now_mm == 2.5:
+        assert change.then is not None
+        assert change.then.depth_mm == pytest.approx(1.0)

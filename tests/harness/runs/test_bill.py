@@ -1,0 +1,77 @@
+"""The bill of a run: what each phase cost, and what a run is expected to cost."""
+
+from __future__ import annotations
+
+import json
+import time
+
+from harness.records.outputs import PROVENANCE
+from harness.runs import bill as bills
+from harness.runs.bill import BILL, PHASES, Bill, Metered, expected
+from harness.runs.jobs import Ended, Job
+from harness.runs.processes import Limits, LocalEngine
+from tests.support import faulty_jobs
+
+
+def test_phases_are_charged_with_this_process_and_with_jobs(monkeypatch):
+    clock = {"s": 2.0}
+    monkeypatch.setattr(bills.time, "process_time", lambda: clock["s"])
+    bill = Bill()
+    bill.begin("detection")
+    clock["s"] = 3.0
+    bill.charge(Job("a view", "renders", time.sleep, ()), Ended("done", processor_s=10.0))
+    bill.charge(Job("a trial", "trials", time.sleep, ()), Ended("failed", processor_s=7.0))
+    bill.begin("statistics")
+    clock["s"] = 3.5
+    bill.charge(Job("a set-up", "trials", time.sleep, ()), Ended("done", processor_s=0.25))
+    bill.divide_trials(frames_share=0.25)
+    assert bill.rounded() == {
+        "imports": 2.0,
+        "plan": 0.0,
+        "renders": 10.0,
+        "frames": 2.0,
+        "detection": 6.0,
+        "statistics": 0.75,
+        "tables and page": 0.0,
+    }
+    assert bill.in_words().startswith("processor seconds: 20.8 (imports 2.0, plan 0.0, ")
+
+
+def test_a_process_says_what_its_jobs_cost():
+    bill = Bill()
+    bill.begin("detection")
+    with Metered(LocalEngine(1, Limits(seconds=60.0)), bill) as engine:
+        engine.submit(Job("works", "trials", faulty_jobs.works, (0.2,)))
+        ((_, ended),) = engine.ended()
+        assert engine.room("trials") == 2
+    assert 0.2 <= ended.processor_s < 1.0
+    assert bill.rounded()["detection"] >= 0.2
+
+
+def stored_bill(folder, done: tuple[int, int], **seconds: float) -> None:
+    """Store a run's bill, with its numbers of renders and trials."""
+    folder.mkdir(parents=True)
+    facts = {
+        BILL: dict.fromkeys(PHASES, 0.0) | seconds,
+        "renders": {"done": done[0]},
+        "trials": {"done": done[1]},
+    }
+    (folder / PROVENANCE.name).write_text(json.dumps(facts))
+
+
+def test_the_expected_cost_comes_from_runs_of_the_same_experiment(tmp_path):
+    assert expected(tmp_path, "crack", 10, 100) == ""
+    stored_bill(tmp_path / "other" / "1", (1, 1), renders=50.0, imports=1.0)
+    assert expected(tmp_path, "crack", 10, 100) == (
+        "about 501 processor seconds from nothing (500 for renders, 0 for trials), "
+        "as runs of other experiments took"
+    )
+    first = {"renders": 4.0, "frames": 5.0, "detection": 10.0, "plan": 1.5}
+    stored_bill(tmp_path / "crack" / "1", (2, 50), **first)
+    stored_bill(tmp_path / "crack" / "2", (0, 0), statistics=3.0)
+    (tmp_path / "crack" / "3").mkdir()
+    (tmp_path / "crack" / "3" / PROVENANCE.name).write_text("{}")
+    assert expected(tmp_path, "crack", 10, 100) == (
+        "about 53 processor seconds from nothing (20 for renders, 30 for trials), "
+        "as runs of this experiment took"
+    )
