@@ -238,6 +238,7 @@ def units_effect(rows: Targets, curve: PodCurve, pod: float) -> float:
 
     The variances of boards and of units add up, less that of their combinations, which both
     contain (Cameron, Gelbach and Miller, J. Business & Economic Statistics 29 (2011), 238)."""
+    assert rows.unit is not None
     influence = _influence(rows, curve, pod)
     _, board = np.unique(rows.board, return_inverse=True)
     _, unit = np.unique(rows.unit, return_inverse=True)
