@@ -117,10 +117,10 @@ class SetUpLimit:
 
     @property
     def boards_matter(self) -> bool:
-        """Return whether the limit over boards exceeds a90/95 by more than 10 %, with a known
-        design effect."""
+        """Return whether the limit over boards exceeds a90/95 by more than 10 %, with a design
+        effect above 1."""
         wider = self.over_boards.value > WIDER * self.a90_95.value
-        return bool(np.isfinite(self.design_effect) and wider)
+        return bool(self.design_effect > 1 and wider)
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,6 +160,7 @@ def test_a_limit_over_boards_is_wider_by_a_tenth_where_boards_matter() -> None:
 
     assert matters(1.11, 2.0)
     assert not matters(1.09, 2.0)
+    assert not matters(1.11, 0.9)
     assert not matters(1.11, np.nan)
 
 
