@@ -234,13 +234,17 @@ def design_effect(
 
 def units_effect(rows: Targets, curve: PodCurve, pod: float) -> float:
     """Return the variance of the size with this POD with boards and units drawn over that with
-    boards alone, at least 1; ``rows``: each unit's inspections of a damage.
+    boards alone, at least 1, and 1 where it is not known; ``rows``: each unit's inspections of a
+    damage.
 
     The variances of boards and of units add up, less that of their combinations, which both
     contain (Cameron, Gelbach and Miller, J. Business & Economic Statistics 29 (2011), 238)."""
+    assert rows.unit is not None
     influence = _influence(rows, curve, pod)
     _, board = np.unique(rows.board, return_inverse=True)
     _, unit = np.unique(rows.unit, return_inverse=True)
+    if min(board.max(), unit.max()) < 1:
+        return 1.0  # a single board or unit tells nothing
     units = int(unit.max()) + 1
     _, combination = np.unique(board * units + unit, return_inverse=True)
     of_boards = _sandwich(np.bincount(board, influence))

@@ -187,6 +187,8 @@ def test_the_effect_of_units_is_one_plus_what_they_add_to_the_boards_variance() 
     expected = 1 + (of_units - of_rows) / of_boards
     assert expected > 1.5
     assert units_effect(rows, CURVE, 0.5) == pytest.approx(expected, rel=1e-9)
+    assert units_effect(replace(rows, board=np.zeros(120, int)), CURVE, 0.5) == 1.0
+    assert units_effect(replace(rows, unit=np.zeros(120, int)), CURVE, 0.5) == 1.0
 
 
 def test_draws_below_zero_are_zero() -> None:
