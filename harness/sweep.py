@@ -56,6 +56,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         from harness.experiment.load import load_experiment
         from harness.experiment.schema import CaptureSource
 
+        if not options.dry_run:
+            from harness.runs.study import run_study
+
     experiment = load_experiment(
         options.experiment, options.overrides, options.calibration, quick=options.quick
     )
@@ -67,9 +70,6 @@ def main(options: argparse.Namespace, command: str) -> int:
         from harness.runs.estimate import dry_run
 
         return dry_run(experiment, options.out, run_options)
-    with loading():
-        from harness.runs.study import run_study
-
     return run_study(experiment, options.out, run_options, command)
 
 

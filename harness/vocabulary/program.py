@@ -88,12 +88,16 @@ def loading() -> Iterator[None]:
     """Import modules without looking for garbage, of which they leave none, and leave them out of
     all later searches. This saves a tenth of the processor time of imports, and a third of what
     reading the project's sources takes afterwards."""
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
-        gc.enable()
+        # what is frozen is never freed, garbage of earlier runs in this process included
+        if not gc.get_freeze_count():
+            gc.freeze()
+        if was_enabled:
+            gc.enable()
 
 
 def program(

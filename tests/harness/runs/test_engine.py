@@ -98,6 +98,8 @@ def test_provenance_is_stored(finished):
     assert printed["command"].startswith("tofpod sweep ")
     assert printed["versions"]["mitsuba"]
     assert set(printed) >= {"commit", "dirty", "machine", "failures", "seconds"}
+    spent = printed["processor_seconds"]
+    assert min(spent["imports"], spent["frames"], spent["detection"], spent["tables and page"]) > 0
     import pyarrow.parquet as pq
 
     inside = json.loads(pq.read_schema(results(finished) / "trials.parquet").metadata[b"tofpod"])
