@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from detectors.pixels.medians import group_medians
 from detectors.pixels.noise import average_variance_m2, rounding_floor, sigma_of
@@ -40,6 +40,8 @@ from detectors.surfaces.expected import (
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, ExpectedSurface, invert
 
+LEAST_POINTS = 100
+"""Fewest points of a part: with less, cells of 16 do not span a surface."""
 LONGEST_EDGES = 3.0
 """Longest edge of a triangle, in typical edges: longer ones span gaps of the view."""
 COARSE = 4.0
@@ -122,9 +124,15 @@ def _scan(
     parts: int,
 ) -> PartScan:
     plan = _plan(points_m, central)
-    if len(points_m) < 100 or np.linalg.matrix_rank(plan - plan.mean(axis=0)) < 2:
-        raise UserError(f"{name}: {len(points_m)} points of the part span no surface")
+    no_surface = UserError(
+        f"{name}: {len(points_m)} points of the part span no surface",
+        fix="record more of the part, or choose another surface (--target, --crop)",
+    )
+    if len(points_m) < LEAST_POINTS:
+        raise no_surface
     faces, edge = _faces(plan)
+    if not len(faces):
+        raise no_surface
     # cells of the view, each with the median of its points
     cells = np.floor((plan - plan.min(axis=0)) / (COARSE * edge)).astype(np.int64)
     _, group = np.unique(cells, axis=0, return_inverse=True)
@@ -138,6 +146,8 @@ def _scan(
     scale = medians_m[:, None] if central else 1.0
     coarse_m = np.column_stack([middles * scale, medians_m])
     coarse_faces, _ = _faces(middles)
+    if not len(coarse_faces):
+        raise no_surface
     triangles = _towards_viewer(points_m, faces, variances_m2, central)
     sides_m = np.linalg.norm(triangles.corners_m[:, 0] - triangles.corners_m[:, 1], axis=1)
     return PartScan(
@@ -160,8 +170,11 @@ def _plan(points_m: np.ndarray, central: bool) -> np.ndarray:
 
 def _faces(plan: np.ndarray) -> tuple[np.ndarray, float]:
     """Return triangles (m, 3) between neighbours of places (n, 2), without those that span gaps,
-    and the length of a typical edge."""
-    faces = Delaunay(plan).simplices
+    and the length of a typical edge. No triangles and 0 if the places lie on a line."""
+    try:
+        faces = Delaunay(plan).simplices
+    except (QhullError, ValueError):
+        return np.zeros((0, 3), np.int64), 0.0
     corners = plan[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     typical = float(np.median(edges))

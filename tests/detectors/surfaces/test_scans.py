@@ -116,6 +116,13 @@ def test_mistakes_are_told() -> None:
     corner[72:] = False
     with pytest.raises(UserError, match=r"corner: shows \d+ % of the part"):
         laid_under(scan_of(flat, corner, "corner"), flat, mask)
+    line = np.zeros_like(mask)
+    line[60, 26:123] = True
+    few = np.zeros_like(mask)
+    few[60:63, 60:100] = True
+    for seen_part in (line, few):
+        with pytest.raises(UserError, match=r"piece: \d+ points of the part span no surface"):
+            scan_of(flat, seen_part, "piece")
     in_metres = replace(EARLIER, points_m=1e3 * EARLIER.points_m)
     with pytest.raises(UserError, match=r"metres: is 1\.7\d*e\+05 mm large, and this part 17\d mm"):
         laid_under(scan_of(in_metres, EARLIER_MASK, "metres"), flat, mask)
