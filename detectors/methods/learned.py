@@ -79,7 +79,7 @@ class LearnedDetector(MatchedDetector):
 
     settings_type: ClassVar[type[LearnedConfig]] = LearnedConfig
     name = "learned"
-    version = 1
+    version = 2
 
     def scored(
         self,
