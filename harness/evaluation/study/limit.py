@@ -4,7 +4,7 @@ The quoted limit is the bound of the hit/miss curves that fit about equally well
 (`harness.evaluation.pod.averaged`). It takes damages as independent targets, which damages of one
 board are not quite; so a second bound, and the intervals of a50 and a90, are of curves that are
 shifted from board to board (`harness.evaluation.pod.clustered`). Percentiles over resampled boards
-do not replace them: with few targets, flat curves or boards that differ they cover in 72 to 93 %
+do not replace them: with few targets, flat curves or boards that differ they cover in 75 to 92 %
 of studies. Resampled boards serve comparisons, in which what two set-ups share cancels.
 ``tofpod audit`` measures how often all of these cover."""
 
