@@ -19,7 +19,7 @@ from harness import __version__
 from harness.experiment.digests import simulation_digests
 from harness.programs.atlas.ask import main
 from harness.programs.atlas.limits import Outside, surfaces_of
-from tests.harness.report.test_view3d import browsed
+from tests.support.browser import opened
 
 THROUGH = {"kind": "through", "per_board": 6, "diameter_mm": [2.0, 40.0]}
 BLIND = [
@@ -278,7 +278,7 @@ def test_a_browser_answers_as_the_sliders_move(stored: Path):
     )
     page = stored / "out" / "moved.html"
     page.write_text((stored / "out" / "atlas.html").read_text().replace("</body>", SLIDE))
-    answers = re.search(r'data-said="([^"]+)"', browsed(page))
+    answers = re.search(r'data-said="([^"]+)"', opened(page, page.parent, "--window-size=900,600"))
     assert answers is not None
     reached, large, large_row, small, small_row, lines, fits = answers[1].split("|")
     assert reached == "5 of 5"  # of one albedo there is no choice
