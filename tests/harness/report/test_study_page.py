@@ -11,10 +11,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.records.trials import ResultTables
+from harness.report.limits_figure import _draw_row
 from harness.report.study_page import study_html, study_parts
 from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
@@ -177,6 +179,16 @@ def test_the_first_figure_shows_each_interval_of_a90_in_a_row_of_its_own(
     for name, (low_mm, high_mm, row) in expected.items():
         ends_mm = (low_mm, min(high_mm, whole.limits[row].largest_mm), row)
         assert rows[name] == pytest.approx(ends_mm, rel=1e-3)
+
+
+def test_the_first_figure_marks_the_limit_to_quote_with_its_number(whole: StudyResult) -> None:
+    limit = whole.limits[0]
+    axes = Figure().subplots()
+    _draw_row(axes, 0, limit, "a set-up", limit.largest_mm)
+    _, estimate, bound = axes.get_lines()
+    assert estimate.get_xdata()[0] == limit.a90_mm
+    assert bound.get_xdata()[0] == limit.a90_95.value > limit.a90_mm
+    assert [text.get_text() for text in axes.texts] == [size(limit.a90_95.value)]
 
 
 def test_the_users_words_are_escaped(page: str) -> None:
