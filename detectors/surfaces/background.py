@@ -59,6 +59,8 @@ noise grows."""
 FREE_FORM_FROM = 0.02  # share of the area with structure from which a free form is tried
 MISFIT_FROM = 0.1
 """Share of the area with structure from which a warning of a misfit is given."""
+MISFIT_AT_RIM_FROM = 0.05
+"""The same for what lies off the surface at the rim, where other surfaces come into view."""
 STATED = ("polynomial", "mesh", "expected")  # shapes that the user states
 STRUCTURE_CELLS = 5  # side of the block averaged to see structure
 STRUCTURE_SIGMAS = 4.0  # least significance of structure
@@ -341,9 +343,10 @@ def _noise_of_points(cells: _Cells) -> np.ndarray:
     padded = np.pad(cells.image(cells.noise), 3, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))
     around = windows[cells.row, cells.column].reshape(-1, 49)
-    with np.errstate(all="ignore"):
-        local = np.hypot(np.nanmedian(around, axis=1), cells.level_noise)
     pixel = cells.pixel_noise
+    is_known = np.isfinite(around).any(axis=1)
+    local = np.full(len(around), pixel)
+    local[is_known] = np.hypot(np.nanmedian(around[is_known], axis=1), cells.level_noise)
     of_cells = np.where(local > NOISIER * pixel, local, pixel)
     return np.where(cells.cell_of_point >= 0, of_cells[cells.cell_of_point], pixel)
 
@@ -615,12 +618,9 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
     beyond = enough & (np.abs(smooth) > np.maximum(chance, SEEN * pixel))
     rms_m = float(np.sqrt(np.mean(smooth[enough] ** 2))) if enough.any() else 0.0
     share = float(beyond.sum() / max(enough.sum(), 1))
-    # connected cells that lie far off: damage is seldom so large
-    parts = cv2.connectedComponentsWithStats((valid & ~used).astype(np.uint8))[2]
-    areas = parts[1:, cv2.CC_STAT_AREA]
-    off = float(areas.max(initial=0) / max(valid.sum(), 1))
+    off = _share_off(valid & ~used, valid)
     warning = ""
-    if off >= MISFIT_FROM:
+    if off:
         warning = (
             f"the surface does not fit here: {100 * off:.0f} % of the target lies off it "
             f"({name}), "
@@ -635,6 +635,24 @@ def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
             "findings there may be due to its shape"
         )
     return warning, {"misfit_share": share, "misfit_rms_m": rms_m, "local_noise_m": pixel}
+
+
+def _share_off(is_off: np.ndarray, valid: np.ndarray) -> float:
+    """Return the share of the ``valid`` cells (h, w) that another surface takes, of those that lie
+    far off (h, w); 0 if they may be damage, which is seldom so large.
+
+    Another surface is a connected part of `MISFIT_FROM`, or all that reaches the rim if
+    `MISFIT_AT_RIM_FROM` lies within the cells along it, which mix the target with what is
+    behind."""
+    _, labels, facts, _ = cv2.connectedComponentsWithStats(is_off.astype(np.uint8))
+    cells = max(valid.sum(), 1)
+    largest = float(facts[1:, cv2.CC_STAT_AREA].max(initial=0) / cells)
+    outside = np.pad(~valid, 1, constant_values=True)
+    is_rim = grown(outside, 1)[1:-1, 1:-1]
+    reaches_rim = is_off & np.isin(labels, labels[is_rim])
+    if (reaches_rim & ~is_rim).sum() >= MISFIT_AT_RIM_FROM * cells:
+        return max(largest, float(reaches_rim.sum() / cells))
+    return largest if largest >= MISFIT_FROM else 0.0
 
 
 def _block_sums(image: np.ndarray) -> np.ndarray:

@@ -172,6 +172,25 @@ def test_a_board_on_a_floor_taken_for_one_surface_is_warned_of() -> None:
     assert found(measured(plane(), damage=(large_dent,))).warning == ""
 
 
+def test_pieces_of_another_surface_at_the_rim_are_warned_of_together() -> None:
+    """Each of two corners is 4.7 % of the target, and no more than damage may be. Mixed pixels
+    along four sides are 13 % of the cells, none of which lies within the rim."""
+    corners = np.zeros(SHAPE, bool)
+    corners[:36, :30] = True
+    corners[-36:, -30:] = True
+    warning = found(measured(np.where(corners, 1.05, 1.0) * plane())).warning
+    assert warning.startswith("the surface does not fit here: 10 %")
+    assert "a step between two surfaces" in warning
+    corners[-36:, -30:] = False
+    assert found(measured(np.where(corners, 1.05, 1.0) * plane())).warning == ""
+    sides = np.ones(SHAPE, bool)
+    sides[5:-5, 5:-5] = False
+    for rows in (slice(None, 12), slice(-12, None)):
+        sides[rows, :12] = False
+        sides[rows, -12:] = False
+    assert found(measured(np.where(sides, 1.05, 1.0) * plane())).warning == ""
+
+
 @pytest.mark.parametrize("correlated_px", [0.0, 1.2, 2.0])
 def test_flat_boards_stay_planes_and_without_warning(correlated_px: float) -> None:
     answers = [found(measured(plane(), seed, correlated_px)) for seed in range(5)]
