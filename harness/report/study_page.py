@@ -182,9 +182,15 @@ def _examples_of(limit: SetUpLimit, examples: Sequence[StudyExample]) -> list[St
 
 
 def _best(set_ups: Sequence[SetUpResult], examples: Sequence[StudyExample]) -> SetUpLimit | None:
-    """Return the smallest limit of the set-ups with examples; None if there is none."""
+    """Return the smallest limit of the set-ups with examples, among those that limit the same size
+    as the first (a width and a diameter do not compare); None if there is none."""
     limits = [set_up.limit for set_up in set_ups if _examples_of(set_up.limit, examples)]
-    return min(limits, key=lambda limit: limit.a90_95.value, default=None)
+    alike = [limit for limit in limits if _limited_size(limit) == _limited_size(limits[0])]
+    return min(alike, key=lambda limit: limit.a90_95.value, default=None)
+
+
+def _limited_size(limit: SetUpLimit) -> str:
+    return limit.record.inspected.limit_of
 
 
 def _tornadoes(result: StudyResult) -> dict[str, str]:

@@ -17,7 +17,7 @@ from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.records.trials import ResultTables
 from harness.report.limits_figure import _draw_row
-from harness.report.study_page import study_html, study_parts
+from harness.report.study_page import _best, study_html, study_parts
 from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
 from harness.vocabulary.text import size, text_of, unbroken
@@ -145,6 +145,29 @@ def test_every_section_is_there(page: str) -> None:
     ):
         assert f'<figure id="{name}"' in page
     assert "No data for this figure" not in page
+
+
+def test_the_best_set_up_is_sought_among_limits_of_the_same_size(whole: StudyResult) -> None:
+    """A width of 2 mm is no better answer than a diameter of 6 mm."""
+    examples = tuple(
+        example(variant=f"depth <{variant}>", frames=frames)
+        for variant in ("near", "far")
+        for frames in (1, 50)
+    )
+    smallest = _best(whole.set_ups, examples)  # type: ignore[arg-type]
+    assert smallest is not None
+    limits_mm = [set_up.limit.a90_95.value for set_up in whole.set_ups]
+    assert smallest.a90_95.value == min(limits_mm)
+    of_widths = []
+    for set_up in whole.set_ups:
+        limit = set_up.limit
+        if limit is smallest:
+            inspected = replace(limit.record.inspected, size_of="width")
+            limit = replace(limit, record=replace(limit.record, inspected=inspected))
+        of_widths.append(replace(set_up, limit=limit))
+    best = _best(of_widths, examples)  # type: ignore[arg-type]
+    assert best is not None
+    assert best.a90_95.value == sorted(limits_mm)[1]
 
 
 def test_nothing_comes_from_outside(structure: Structure) -> None:
