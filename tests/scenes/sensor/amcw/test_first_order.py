@@ -423,6 +423,16 @@ def test_a_displaced_frame_is_farther_by_its_displacement():
     assert np.nanmedian(change_m) == pytest.approx(expected_m, abs=1e-3)
 
 
+def test_limits_of_range_allow_for_the_largest_displacement_of_a_frame():
+    """A jump, the drift and six deviations of the jitter in the same direction."""
+    unit = unit_before_hole("azure_kinect_nfov", 200.0)
+    model = unit.first_order
+    assert model is not None
+    jitter_mm = unit.model.jitter_mm(unit.exposure)
+    assert jitter_mm > 0.02
+    assert model.farthest_error_m / MM == pytest.approx(17.0 + 2.0 + 6.0 * jitter_mm)
+
+
 def trial(
     unit: SimulatedUnit,
     number: int,
