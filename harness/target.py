@@ -39,7 +39,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 @program(
     _options,
     "Build a target with damage from its declaration, print its truth, and write its mesh.",
-    epilog="example: tofpod target thesis --out board.glb --truth truth.json",
+    "tofpod target thesis --out board.glb --truth truth.json",
+    "tofpod target thesis --hole-free --out board.ply",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake."""

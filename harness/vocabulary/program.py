@@ -21,6 +21,17 @@ Options = Callable[[argparse.ArgumentParser], None]
 Run = Callable[[argparse.Namespace, str], int]
 
 
+class _HelpFormatter(argparse.HelpFormatter):
+    """Wraps paragraphs, and leaves indented lines as they are, so that they can be copied."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = []
+        for line in text.splitlines():
+            is_copied = line.startswith(" ")
+            paragraphs.append(line if is_copied else super()._fill_text(line, width, indent))
+        return "\n".join(paragraphs)
+
+
 @dataclass(frozen=True)
 class Program:
     """A program, ``tofpod <name>``. A call parses the arguments (None: those of the command line)
@@ -34,6 +45,8 @@ class Program:
     """Does its work; takes the parsed arguments and the whole command, and returns the exit code.
     """
     description: str
+    examples: tuple[str, ...]
+    """Two whole commands, which its help shows and a test runs."""
     epilog: str | None = None
     further: Mapping[str, Program] = field(default_factory=dict)
     """Programs that a first word of the arguments names: ``tofpod gauge read``."""
@@ -47,8 +60,13 @@ class Program:
 
     def parser(self) -> argparse.ArgumentParser:
         """Return a parser of its arguments."""
+        parts = [self.epilog] if self.epilog else []
+        parts += ["examples:", *(f"  {example}" for example in self.examples)]
         parser = argparse.ArgumentParser(
-            prog=self.command, description=self.description, epilog=self.epilog
+            prog=self.command,
+            description=self.description,
+            epilog="\n".join(parts),
+            formatter_class=_HelpFormatter,
         )
         self.options(parser)
         return parser
@@ -103,6 +121,7 @@ def loading() -> Iterator[None]:
 def program(
     options: Options,
     description: str,
+    *examples: str,
     epilog: str | None = None,
     further: Mapping[str, Program] | None = None,
 ) -> Callable[[Run], Program]:
@@ -111,7 +130,15 @@ def program(
 
     def decorated(run: Run) -> Program:
         name = Path(run.__code__.co_filename).stem
-        return Program(name, options, run, description, epilog, further or {})
+        return Program(
+            name=name,
+            options=options,
+            run=run,
+            description=description,
+            examples=examples,
+            epilog=epilog,
+            further=further or {},
+        )
 
     return decorated
 

@@ -86,7 +86,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "State which cameras find damage of a given size nine times out of ten at a given distance,"
     " with how many frames, from a stored table of limits of simulated set-ups"
     " (experiments/atlas.yaml), with intervals. Nothing is extrapolated.",
-    epilog="example: tofpod ask --damage hole --size 5mm --distance 1m",
+    "tofpod ask --damage hole --size 5mm --distance 1m",
+    "tofpod ask --size 0.25in --distance 70cm --camera azure_kinect_nfov --frames 50",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""

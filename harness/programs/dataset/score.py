@@ -70,8 +70,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "with AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
     "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for "
     "likely damage.",
-    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
-    "two such folders of results.",
+    "tofpod score maps --dataset boards --out scores",
+    "tofpod score maps --dataset boards --name ours --out scores",
+    epilog="tofpod compare compares two such folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""

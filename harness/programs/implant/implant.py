@@ -158,8 +158,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "is one static capture. The frames keep their own noise, fixed pattern and surface; "
     "only the damage is "
     "simulated.",
-    epilog="example: tofpod implant captures/wall --camera azure_kinect_nfov --damage through "
-    "--diameters 2:10 --out implanted",
+    "tofpod implant captures/wall --camera azure_kinect_nfov --damage through --diameters 2:10",
+    "tofpod implant captures/wall --camera kinect_v2 --damage dent --diameters 8:30 --depths 1:4",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130

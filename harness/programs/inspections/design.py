@@ -88,8 +88,9 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
     "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, "
     "and which sizes to make.",
-    epilog="example: tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study "
-    "takes about 40 ms.",
+    "tofpod design --a50 5 --a90 7 --sizes 2 12",
+    "tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9",
+    epilog="A simulated study takes about 40 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130

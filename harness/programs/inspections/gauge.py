@@ -90,9 +90,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the "
     "limit that tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), "
     "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs.",
-    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 "
-    "frames' --out gauge, then drill, record, and tofpod gauge read captures/gauge --gauge "
-    "gauge/gauge.json --out found",
+    "tofpod gauge --diameters 2:12 --a50 4 --a90 6 --out gauge",
+    "tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out gauge",
+    epilog="The holes are drilled, the board is recorded, and tofpod gauge read finds them.",
     further={"read": READ},
 )
 def main(options: argparse.Namespace, command: str) -> int:

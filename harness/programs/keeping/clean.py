@@ -40,8 +40,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Remove stored renders or results. Only files that tofpod wrote below --out are "
     "removed, links are never "
     "followed, and files of a running sweep are kept.",
-    epilog="examples: tofpod clean cache --limit 5GB; "
-    "tofpod clean results averaging/69346a82f4194e03 --dry-run",
+    "tofpod clean cache --limit 5GB",
+    "tofpod clean results averaging --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for

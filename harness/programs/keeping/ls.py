@@ -45,9 +45,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "through the entry point "
     "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of "
     "renders, the age of stored answers (artefacts), or all keys of an experiment.",
-    epilog="examples: tofpod ls; tofpod ls thesis; tofpod ls cameras kinect_v2; "
-    "tofpod ls --json; tofpod ls results; tofpod ls results averaging; "
-    "tofpod ls cache; tofpod ls artefacts",
+    "tofpod ls cameras kinect_v2",
+    "tofpod ls thesis",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if something listed is broken), 2 for a user's mistake."""

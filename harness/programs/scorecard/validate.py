@@ -75,6 +75,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Measure the simulated cameras like real cameras, and compare each published figure with the "
     "simulated figure. With --capture: compare a real capture of a static scene with the "
     "simulation of the planes and edges in it.",
+    "tofpod validate --camera azure_kinect_nfov",
+    "tofpod validate --capture captures/wall --camera azure_kinect_nfov",
     epilog="The exit code is 1 if a figure or a family of figures fails and its entry in the file "
     "gives no reason, or if --power finds other untested constants than are on file.",
 )

@@ -28,7 +28,7 @@ def seen_by_a_program(monkeypatch: pytest.MonkeyPatch, stated: str | None) -> li
             monkeypatch.delenv(name)
     monkeypatch.setattr(sys, "argv", ["tofpod"])
     monkeypatch.setattr("signal.signal", lambda number, handler: None)
-    program = Program("looks", lambda parser: None, run, "Looks at its environment.")
+    program = Program("looks", lambda parser: None, run, "Looks at its environment.", ())
     assert program() == 0
     return seen
 
