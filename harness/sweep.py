@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "and write a report."
     ),
     "tofpod sweep averaging --quick",
-    "tofpod sweep detection_limit --set source.target.distance_m=0.9 --jobs 8",
+    "tofpod sweep detection_limit --set source.target.distance_m=90cm --jobs 8",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

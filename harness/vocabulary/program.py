@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import math
 import os
 import re
 import shlex
@@ -14,11 +15,42 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NoReturn
 
 from harness.vocabulary.errors import UserError, exit_code_of
+from harness.vocabulary.lengths import LEGAL, in_unit, states_unit
+from harness.vocabulary.words import nearest
 
 Options = Callable[[argparse.ArgumentParser], None]
 Run = Callable[[argparse.Namespace, str], int]
+
+
+class _Parser(argparse.ArgumentParser):
+    """States a mistake in one message, without the list of all options, and with the nearest legal
+    word."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            option = unknown[0].partition("=")[0]
+            meant = nearest(option, options) if option.startswith("-") else None
+            problem = f"{unknown[0]}: there is no such {'option' if meant else 'argument'}"
+            self.error(problem + (f"; did you mean {meant}?" if meant else ""))
+        return parsed
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is None or value in action.choices:
+            return
+        words = [str(choice) for choice in action.choices]
+        meant = nearest(value, words)
+        problem = f"{str(value)!r} is none of its values"
+        problem += f"; did you mean {meant!r}?" if meant else ""
+        raise argparse.ArgumentError(action, f"{problem}\n  legal: {', '.join(words)}")
+
+    def error(self, message: str) -> NoReturn:
+        problem = message.removeprefix("argument ")
+        self.exit(2, f"error: {problem}\n  to do: {self.prog} --help shows all options\n")
 
 
 class _HelpFormatter(argparse.HelpFormatter):
@@ -62,7 +94,7 @@ class Program:
         """Return a parser of its arguments."""
         parts = [self.epilog] if self.epilog else []
         parts += ["examples:", *(f"  {example}" for example in self.examples)]
-        parser = argparse.ArgumentParser(
+        parser = _Parser(
             prog=self.command,
             description=self.description,
             epilog="\n".join(parts),
@@ -154,23 +186,40 @@ def whole_number(largest: int) -> Callable[[str], int]:
     return parsed
 
 
-def span(text: str) -> tuple[float, float]:
-    """Return the ends of FROM:TO, for argparse."""
-    try:
-        low, high = map(float, text.split(":"))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO, such as 2:10") from error
-    return low, high
+def length(unit: str, *, least: float = 0.0) -> Callable[[str], float]:
+    """Return a parser of lengths in ``unit``, above ``least``, for argparse. A bare number is in
+    ``unit``."""
+
+    def parsed(text: str) -> float:
+        value = in_unit(text, unit)
+        if value is None or not least < value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a length, {LEGAL}")
+        return value
+
+    return parsed
+
+
+def span(unit: str) -> Callable[[str], tuple[float, float]]:
+    """Return a parser of FROM:TO, two lengths in ``unit``, for argparse. A unit after the second
+    only is that of both."""
+
+    def parsed(text: str) -> tuple[float, float]:
+        low_text, colon, high_text = text.partition(":")
+        if not states_unit(low_text) and states_unit(high_text):
+            low_text += re.sub(r"[^a-z]|e(?=[-+\d])", "", high_text)
+        low = in_unit(low_text, unit)
+        high = in_unit(high_text, unit)
+        if not colon or low is None or high is None:
+            raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO, such as 2:10 or 2:10mm")
+        return low, high
+
+    return parsed
 
 
 def length_m(option: str, text: str) -> float:
-    """Convert a length with its unit to metres. Raises UserError that names the option."""
-    from harness.vocabulary.meshes import UNITS_M
-
-    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]+)\s*", text)
-    if match is None or match[2] not in UNITS_M or not float(match[1]) > 0:
-        raise UserError(
-            f"{option} {text}: is not a length with a unit",
-            legal="such as 5mm, 0.5cm, 1m or 0.25in",
-        )
-    return float(match[1]) * UNITS_M[match[2]]
+    """Convert a length that must state its unit to metres. Raises UserError that names the
+    option."""
+    value = in_unit(text, "m") if states_unit(text) else None
+    if value is None or not 0 < value < math.inf:
+        raise UserError(f"{option} {text}: is not a length with a unit", legal=LEGAL)
+    return value

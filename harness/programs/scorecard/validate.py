@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="frames of a static scene, as read by tofpod detect",
     )
     add_reading(put)
-    put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
+    put("--max-frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
     put(
         "--mask",
         type=Path,
@@ -101,7 +101,7 @@ def main(options: argparse.Namespace, command: str) -> int:
             )
         reading = {
             **reading_of(options),
-            "frames": slice(options.frames) if options.frames else None,
+            "frames": slice(options.max_frames) if options.max_frames else None,
         }
         recording = (
             opened(options.capture, options.intrinsics, **reading) if options.capture else None

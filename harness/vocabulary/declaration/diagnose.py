@@ -21,6 +21,7 @@ from harness.vocabulary.declaration.yaml_source import (
     Source,
 )
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lengths import LEGAL, unit_of_key
 from harness.vocabulary.words import nearest
 
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
@@ -213,6 +214,9 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
         "list_type",
     ):
         return Problem(f"`{dotted(path)}` is {shown(value)}", position, legal)
+    unit = next((unit_of_key(key) for key in reversed(path) if isinstance(key, str)), None)
+    if kind == "float_type" and unit is not None and isinstance(value, str):
+        legal = f"{legal or 'a number'}, in {unit}; or a length with a unit, {LEGAL}"
     if kind.startswith("int_") and isinstance(value, float) and value.is_integer():
         fix = f"write {int(value)} without a decimal point or exponent"
     if kind.startswith("bool_") and str(value).lower() in YES_AND_NO:

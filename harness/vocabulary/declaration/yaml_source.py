@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from ruamel.yaml.parser import Parser
 from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lengths import converted
 
 # Characters of a source line that a message shows; longer lines are cut around the caret
 SHOWN_COLUMNS = 110
@@ -136,6 +138,10 @@ KeyPath = tuple[
 MAX_BYTES = 500_000
 MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
 MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
+NAMING = ("path", "key")
+"""Keys of variations and of unknowns that name another key."""
+NAMED = ("values", "range")
+"""Keys beside these with values of the key that is named."""
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
@@ -230,10 +236,13 @@ def read_yaml(path: Path) -> Source:
     raise DeclarationError(str(path), [Problem(message, position, legal=legal, fix=fix)])
 
 
-def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
+def parse_yaml(
+    text: str, origin: str, *, start: int = 0, is_argument: bool = False, key: str = ""
+) -> Source:
     """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text
-    is an argument of the command line, so that places have no line number. Raises
-    DeclarationError."""
+    is an argument of the command line, so that places have no line number; ``key`` is the key
+    whose value the text is. Lengths with a unit become numbers in the unit that their key's name
+    states: ``distance_m: 90cm`` is 0.9. Raises DeclarationError."""
     starts = [0, *(match.end() for match in re.finditer("\n", text))]
     lines = text.split("\n")
 
@@ -254,7 +263,7 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
     try:
         root = reader.compose(text[start:])
         builder = _Builder(place)
-        data = None if root is None else builder.build(root, (), ())
+        data = None if root is None else converted(key, builder.build(root, (), ()))
         if not builder.problems:
             return Source(origin, text, data, {(): place(0, 0), **builder.values}, builder.keys)
         raise DeclarationError(origin, builder.problems)
@@ -371,7 +380,7 @@ class _Builder:
             key = self._scalar(key_node, key_place) if isinstance(key_node, ScalarNode) else None
             if isinstance(key, str) and key not in result:
                 self.keys[(*path, key)] = key_place
-                result[key] = self.build(value_node, (*path, key), within)
+                result[key] = converted(key, self.build(value_node, (*path, key), within))
             elif isinstance(key, str):
                 first = self.keys[(*path, key)]
                 message = f"duplicate key `{key}`"
@@ -386,6 +395,9 @@ class _Builder:
                 )
             elif len(self.problems) == before:
                 self._refuse("a key must be text", key_place, "text; put quotes around numbers")
+        for naming, values in product(NAMING, NAMED):
+            if values in result and isinstance(result.get(naming), str):
+                result[values] = converted(result[naming], result[values])
         return result
 
     def _scalar(self, node: Node, position: Place) -> Any:
