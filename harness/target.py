@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
+from harness.vocabulary.words import nearest
 
 if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
@@ -80,8 +81,10 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
             )
         config = settings_of(TARGETS[what["name"]], what, "target")
     elif not Path(what).exists():
+        meant = nearest(what, NAMED_TARGETS)
         raise UserError(
-            f"{what}: there is no such file or named target",
+            f"{what}: there is no such file or named target"
+            + (f"; did you mean {meant!r}?" if meant else ""),
             legal=f"{', '.join(NAMED_TARGETS)} or a file",
         )
     else:

@@ -12,7 +12,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -32,12 +32,16 @@ class _Parser(argparse.ArgumentParser):
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         parsed, unknown = self.parse_known_args(args, namespace)
         if unknown:
-            options = [option for action in self._actions for option in action.option_strings]
-            option = unknown[0].partition("=")[0]
-            meant = nearest(option, options) if option.startswith("-") else None
-            problem = f"{unknown[0]}: there is no such {'option' if meant else 'argument'}"
-            self.error(problem + (f"; did you mean {meant}?" if meant else ""))
+            self.refuse(unknown[0])
         return parsed
+
+    def refuse(self, word: str, further: Iterable[str] = ()) -> NoReturn:
+        """Exit because of a word that is none of the options, nor of the ``further`` words."""
+        is_option = word.startswith("-")
+        options = [option for action in self._actions for option in action.option_strings]
+        meant = nearest(word.partition("=")[0], options if is_option else further)
+        problem = f"{word}: there is no such {'option' if is_option else 'argument'}"
+        self.error(problem + (f"; did you mean {meant}?" if meant else ""))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices:
@@ -90,7 +94,7 @@ class Program:
         called_as_module = Path(sys.argv[0]).stem == self.name
         return f"python -m harness.{self.name}" if called_as_module else f"tofpod {self.name}"
 
-    def parser(self) -> argparse.ArgumentParser:
+    def parser(self) -> _Parser:
         """Return a parser of its arguments."""
         parts = [self.epilog] if self.epilog else []
         parts += ["examples:", *(f"  {example}" for example in self.examples)]
@@ -107,6 +111,8 @@ class Program:
         """Return the program that the arguments name, this or a further one, and its arguments."""
         if words and words[0] in self.further:
             return self.further[words[0]], words[1:]
+        if words and nearest(words[0], self.further) is not None:
+            self.parser().refuse(words[0], self.further)
         return self, words
 
     def __call__(self, arguments: list[str] | None = None) -> int:

@@ -7,8 +7,8 @@ from harness.vocabulary.errors import UserError
 
 DAMAGE = {
     "hole": "through",
-    "through_hole": "through",
-    "blind_hole": "blind",
+    "through-hole": "through",
+    "blind-hole": "blind",
     "crack": "slot",
     "scratch": "gouge",
     "bump": "pressed_bump",
@@ -25,8 +25,9 @@ def nearest(word: object, words: Iterable[object]) -> str | None:
     word (three letters or more), as realsense_l515 contains l515; None if neither."""
     folded = {_folded(word): str(word) for word in words}
     sought = _folded(word)
-    if DAMAGE.get(sought) in folded:
-        return folded[DAMAGE[sought]]
+    kind = kind_called(str(word))
+    if kind != str(word) and kind in folded:
+        return folded[kind]
     matches = difflib.get_close_matches(sought, folded, n=1)
     if not matches and len(sought) >= LEAST_HELD:
         matches = sorted(
@@ -40,13 +41,19 @@ def damage_kind(option: str, word: str, kinds: Iterable[str]) -> str:
     """Return which of the ``kinds`` of damage a user means, by their names or the words of
     `DAMAGE`. Raises UserError that names the option."""
     legal = list(kinds)
-    kind = DAMAGE.get(_folded(word), _folded(word))
+    kind = kind_called(word)
     if kind in legal:
         return kind
     words = [*(said for said, meant in DAMAGE.items() if meant in legal), *legal]
     meant = nearest(word, words)
     hint = f"; did you mean {meant!r}?" if meant else ""
     raise UserError(f"{option} {word}: no such damage here{hint}", legal=", ".join(words))
+
+
+def kind_called(word: str) -> str:
+    """Return the kind of damage that people call so, else the word itself."""
+    called = {_folded(said): kind for said, kind in DAMAGE.items()}
+    return called.get(_folded(word), word)
 
 
 def _folded(word: object) -> str:

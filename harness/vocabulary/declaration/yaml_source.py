@@ -26,6 +26,7 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.lengths import converted
+from harness.vocabulary.words import nearest
 
 # Characters of a source line that a message shows; longer lines are cut around the caret
 SHOWN_COLUMNS = 110
@@ -138,6 +139,15 @@ KeyPath = tuple[
 MAX_BYTES = 500_000
 MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
 MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
+INDENTATION = {
+    r"'\t'": "indent with spaces, not with tabs",
+    "expected <block end>": "let all keys of a mapping begin in the same column",
+    "mapping values are not allowed": (
+        "write the keys that belong to a key on lines of their own, indented further; put quotes "
+        "around text with a colon"
+    ),
+}
+"""What to do about the parser's messages that a wrong indentation causes."""
 NAMING = ("path", "key")
 """Keys of variations and of unknowns that name another key."""
 NAMED = ("values", "range")
@@ -201,6 +211,7 @@ def read_yaml(path: Path) -> Source:
     path = Path(path)
     position = None
     legal = None
+    meant = None
     fix = None
     try:
         with path.open("rb") as stream:
@@ -222,6 +233,7 @@ def read_yaml(path: Path) -> Source:
             sorted(str(file) for file in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
         )
         message = "there is no such file"
+        meant = nearest(path, yaml_files)
         legal = ", ".join(yaml_files[:10]) or None
     except IsADirectoryError:
         message = "this is a folder, not a YAML file"
@@ -233,7 +245,7 @@ def read_yaml(path: Path) -> Source:
         position = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + undecodable)
         message = f"byte 0x{content[error.start]:02x} is not UTF-8"
         fix = "save the file as UTF-8"
-    raise DeclarationError(str(path), [Problem(message, position, legal=legal, fix=fix)])
+    raise DeclarationError(str(path), [Problem(message, position, legal, meant, fix)])
 
 
 def parse_yaml(
@@ -280,8 +292,9 @@ def parse_yaml(
             else None
         )
         what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
+        fix = next((fix for said, fix in INDENTATION.items() if said in what), None)
         problem = Problem(
-            f"not valid YAML: {what}", where, other=begun, other_says="which began at"
+            f"not valid YAML: {what}", where, fix=fix, other=begun, other_says="which began at"
         )
     except ReaderError as error:
         index = int(error.position)
