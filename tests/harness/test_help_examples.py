@@ -19,7 +19,7 @@ from harness.experiment.load import load_experiment
 from harness.vocabulary.program import Program
 from scenes.sensor.camera import camera_names
 
-RUN = ("ask", "ls", "pod", "target")
+RUN = ("ask", "ls", "pod", "start", "target")
 """Programs whose examples take seconds at most; test_documents runs others on small inputs."""
 
 
