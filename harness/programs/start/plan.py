@@ -1,4 +1,4 @@
-"""From answers to an experiment, which varies one that comes with tofpod, and to commands."""
+"""Turns answers into an experiment, which varies one that comes with tofpod, and into commands."""
 
 import math
 import shlex
@@ -45,8 +45,8 @@ FILLED = 0.3
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What a user has answered."""
+class Inquiry:
+    """An inspection that a user has in mind."""
 
     camera: str
     """A camera's name, or the path of its file."""
@@ -73,41 +73,41 @@ class Answers:
         return [_rounded(smallest_mm), _rounded(LARGEST * self.tolerance_mm)]
 
 
-def experiment_text(answers: Answers, name: str) -> str:
+def experiment_text(inquiry: Inquiry, name: str) -> str:
     """Return the YAML of an experiment that measures the limit."""
-    data = dict(read_yaml(shipped("experiments") / f"{PARTS[answers.part]}.yaml").data)
+    data = dict(read_yaml(shipped("experiments") / f"{PARTS[inquiry.part]}.yaml").data)
     data["name"] = name
-    data["title"] = f"Is a damage of {answers.tolerance_mm:g} mm ({answers.kind}) found?"
+    data["title"] = f"Is a damage of {inquiry.tolerance_mm:g} mm ({inquiry.kind}) found?"
     target = dict(data["source"]["target"])
-    target["damage"] = _damage(answers, target)
-    target["apart_mm"] = _apart_mm(answers)
-    target["distance_m"] = answers.distance_m
-    data["source"] = {**data["source"], "target": target, "camera": {"name": answers.camera}}
+    target["damage"] = _damage(inquiry, target)
+    target["apart_mm"] = _apart_mm(inquiry)
+    target["distance_m"] = inquiry.distance_m
+    data["source"] = {**data["source"], "target": target, "camera": {"name": inquiry.camera}}
     data["matching"] = {"radius_mm": HIT_RADIUS_MM, "overlap": 0.5}
     data["sweep"] = {"detector.name": ["thesis", "matched"], "capture.frames": FRAMES}
     data.pop("unknowns", None)
     head = (
-        f"# Written by tofpod start; part and surroundings as in {PARTS[answers.part]}.yaml of\n"
+        f"# Written by tofpod start; part and surroundings as in {PARTS[inquiry.part]}.yaml of\n"
         "# tofpod. All keys: tofpod ls keys.\n"
     )
     return head + to_yaml(data)
 
 
-def commands(answers: Answers, file: Path) -> list[tuple[str, str]]:
+def commands(inquiry: Inquiry, file: Path) -> list[tuple[str, str]]:
     """Return three commands to run, each with what it tells."""
     sweep = f"tofpod sweep {shlex.quote(str(file))}"
-    if answers.recording is None:
+    if inquiry.recording is None:
         return [
             (f"{sweep} --dry-run", "what will be computed, and how long it takes"),
             (f"{sweep} --quick", "a first page with a third of the boards"),
             (sweep, "the limit with its interval, as a page"),
         ]
-    recording = shlex.quote(str(answers.recording))
-    first = f"tofpod detect {recording} --tolerance width={answers.tolerance_mm:g}mm --out findings"
+    recording = shlex.quote(str(inquiry.recording))
+    first = f"tofpod detect {recording} --tolerance width={inquiry.tolerance_mm:g}mm --out findings"
     second = f"{sweep} --quick"
     told = "a first page of the simulated limit"
-    if answers.kind in IMPLANTED:
-        second = _implant(answers, recording)
+    if inquiry.kind in IMPLANTED:
+        second = _implant(inquiry, recording)
         told = "the limit of your camera on this part, by virtual damage"
     return [
         (first, "the damage in the recording, and whether the part conforms"),
@@ -116,51 +116,51 @@ def commands(answers: Answers, file: Path) -> list[tuple[str, str]]:
     ]
 
 
-def _implant(answers: Answers, recording: str) -> str:
-    low_mm, high_mm = answers.sizes_mm
+def _implant(inquiry: Inquiry, recording: str) -> str:
+    low_mm, high_mm = inquiry.sizes_mm
     words = [
-        f"tofpod implant {recording} --camera {shlex.quote(answers.camera)}",
-        f"--damage {answers.kind} --diameters {low_mm:g}:{high_mm:g}",
+        f"tofpod implant {recording} --camera {shlex.quote(inquiry.camera)}",
+        f"--damage {inquiry.kind} --diameters {low_mm:g}:{high_mm:g}",
     ]
-    if answers.depth_mm is not None:
-        words.append(f"--depths {answers.depth_mm:g}:{answers.depth_mm:g}")
-    if answers.kind == "slot":
+    if inquiry.depth_mm is not None:
+        words.append(f"--depths {inquiry.depth_mm:g}:{inquiry.depth_mm:g}")
+    if inquiry.kind == "slot":
         words.append(f"--lengths {SLOT_LENGTH_MM:g}:{SLOT_LENGTH_MM:g}")
     return " ".join([*words, "--out implanted"])
 
 
-def _damage(answers: Answers, target: Mapping[str, Any]) -> dict[str, Any]:
+def _damage(inquiry: Inquiry, target: Mapping[str, Any]) -> dict[str, Any]:
     """Return the drawn damage, as many on a board as leave room between them."""
     board = target["board"]
-    apart_mm = _apart_mm(answers)
+    apart_mm = _apart_mm(inquiry)
     area_mm2 = board["width_mm"] * board["height_mm"]
     room = int(FILLED * area_mm2 / (math.pi / 4 * apart_mm**2))
-    sizes_mm = answers.sizes_mm
+    sizes_mm = inquiry.sizes_mm
     damage: dict[str, Any] = {
-        "kind": answers.kind,
+        "kind": inquiry.kind,
         "per_board": max(1, min(target["damage"]["per_board"], room)),
     }
-    if answers.kind == "slot":
+    if inquiry.kind == "slot":
         damage["width_mm"] = sizes_mm
         damage["length_mm"] = [SLOT_LENGTH_MM, SLOT_LENGTH_MM]
-    elif answers.kind == "gouge":
-        width_mm = _rounded(GOUGE_WIDTH * answers.tolerance_mm)
+    elif inquiry.kind == "gouge":
+        width_mm = _rounded(GOUGE_WIDTH * inquiry.tolerance_mm)
         damage["length_mm"] = sizes_mm
         damage["width_mm"] = [width_mm, width_mm]
     else:
         damage["diameter_mm"] = sizes_mm
-    if answers.depth_mm is not None:
-        damage["depth_mm"] = [answers.depth_mm, answers.depth_mm]
+    if inquiry.depth_mm is not None:
+        damage["depth_mm"] = [inquiry.depth_mm, inquiry.depth_mm]
     return damage
 
 
-def _apart_mm(answers: Answers) -> float:
+def _apart_mm(inquiry: Inquiry) -> float:
     """Return the least distance of two centres."""
-    widest_mm = answers.sizes_mm[1]
-    if answers.kind == "slot":
+    widest_mm = inquiry.sizes_mm[1]
+    if inquiry.kind == "slot":
         widest_mm = math.hypot(widest_mm, SLOT_LENGTH_MM)
-    elif answers.kind == "gouge":
-        widest_mm = math.hypot(widest_mm, GOUGE_WIDTH * answers.tolerance_mm)
+    elif inquiry.kind == "gouge":
+        widest_mm = math.hypot(widest_mm, GOUGE_WIDTH * inquiry.tolerance_mm)
     return _rounded(max(2 * HIT_RADIUS_MM, widest_mm) + ROOM_MM)
 
 

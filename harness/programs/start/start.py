@@ -13,7 +13,7 @@ from harness.vocabulary.geometry import MM
 from harness.vocabulary.program import length_m, program
 
 if TYPE_CHECKING:
-    from harness.programs.start.plan import Answers
+    from harness.programs.start.plan import Inquiry
 
 NEEDED = ("camera", "part", "damage", "tolerance")
 """Options without a default: if one is missing, all that are missing are asked for."""
@@ -52,22 +52,22 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.start.plan import commands, experiment_text
 
     asks = any(getattr(options, name) is None for name in NEEDED)
-    answers = _answers(options, asks=asks)
-    proposed = f"{answers.part}_{answers.kind}.yaml"
+    inquiry = _inquiry(options, asks=asks)
+    proposed = f"{inquiry.part}_{inquiry.kind}.yaml"
     name = Question("--out", "Name of the experiment's file", _new_file, proposed)
     file = name.answered(options.out, asks=asks)
-    _write(file, experiment_text(answers, file.stem))
+    _write(file, experiment_text(inquiry, file.stem))
     print(f"wrote {file}\n")
-    three = commands(answers, file)
+    three = commands(inquiry, file)
     wide = max(len(words) for words, _ in three)
     for words, told in three:
         print(f"  {words:{wide}}  # {told}")
     return 0
 
 
-def _answers(options: argparse.Namespace, *, asks: bool) -> Answers:
-    """Return the answers, of options or asked for."""
-    from harness.programs.start.plan import KINDS, PARTS, Answers
+def _inquiry(options: argparse.Namespace, *, asks: bool) -> Inquiry:
+    """Return the inspection that options and answers describe."""
+    from harness.programs.start.plan import KINDS, PARTS, Inquiry
     from harness.vocabulary.words import damage_kind
 
     camera = Question("--camera", "Which camera? (such as azure_kinect_nfov; ? lists all)", _camera)
@@ -105,7 +105,7 @@ def _answers(options: argparse.Namespace, *, asks: bool) -> Answers:
         depth_mm = depth.answered(options.depth, asks=asks)
     elif options.depth is not None:
         raise UserError("--depth: a hole goes through the part", legal="--damage blind-hole")
-    return Answers(
+    return Inquiry(
         camera=chosen_camera,
         recording=chosen_recording,
         part=chosen_part,

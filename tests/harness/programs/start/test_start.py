@@ -12,7 +12,7 @@ import pytest
 
 from harness.__main__ import MODULES, main
 from harness.experiment.load import load_experiment
-from harness.programs.start.plan import IMPLANTED, KINDS, Answers, commands, experiment_text
+from harness.programs.start.plan import IMPLANTED, KINDS, Inquiry, commands, experiment_text
 from harness.programs.start.start import NEEDED
 from harness.vocabulary.words import damage_kind
 
@@ -193,7 +193,7 @@ def test_damage_that_a_part_cannot_have_is_refused(kind, part, home: Path, capsy
 def test_every_part_and_damage_is_an_experiment(kind: str, part: str, home: Path) -> None:
     is_dent = kind in ("dent", "pressed_dent", "pressed_bump")
     depth_mm = None if kind == "through" else 0.5
-    answers = Answers(
+    inquiry = Inquiry(
         camera="kinect_v2",
         recording=home,
         part=part,
@@ -203,13 +203,13 @@ def test_every_part_and_damage_is_an_experiment(kind: str, part: str, home: Path
         distance_m=0.8,
     )
     file = home / "x.yaml"
-    file.write_text(experiment_text(answers, "x"))
+    file.write_text(experiment_text(inquiry, "x"))
     drawn = load_experiment(file).config.simulated.target
     low_mm, high_mm = drawn.damage.size_mm
-    assert low_mm < answers.tolerance_mm < high_mm
+    assert low_mm < inquiry.tolerance_mm < high_mm
     assert drawn.damage.depths_mm == (None if depth_mm is None else (0.5, 0.5))
     drawn.drawn("damaged", 0)
-    detect, second, sweep = commands(answers, file)
+    detect, second, sweep = commands(inquiry, file)
     assert ("implant" in second[0]) == (kind in IMPLANTED)
     assert len(proposed("\n".join(f"  {words}" for words, _ in (detect, second, sweep)))) == 3
 
