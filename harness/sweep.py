@@ -47,6 +47,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "Run an experiment: render its targets, simulate the camera, detect and measure damage, "
         "and write a report."
     ),
+    "tofpod sweep averaging --quick",
+    "tofpod sweep detection_limit --set source.target.distance_m=90cm --jobs 8",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

@@ -16,6 +16,7 @@ from harness.records.outputs import ATLAS_PAGE, ATLAS_PICTURE
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped, strict_json, write_text
 from harness.vocabulary.program import length_m, program
+from harness.vocabulary.words import DAMAGE, kind_called
 
 if TYPE_CHECKING:
     from harness.programs.atlas.limits import LimitSurface
@@ -23,13 +24,6 @@ if TYPE_CHECKING:
 
 STORED = "atlas.parquet"
 """The table of limits that comes with tofpod, in baselines."""
-KINDS = {
-    "hole": "through",
-    "through-hole": "through",
-    "blind-hole": "blind",
-    "crack": "slot",
-}
-"""Kinds of damage by words that users may say instead."""
 LEGAL = "limits.parquet of a study over cameras and distances, as experiments/atlas.yaml makes it"
 NEEDED_AXES = ("source.target.distance_m", "frames")
 NUMBERS = ("a90_mm", "a90_low_mm", "a90_high_mm", "largest_mm", "hits")
@@ -86,7 +80,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "State which cameras find damage of a given size nine times out of ten at a given distance,"
     " with how many frames, from a stored table of limits of simulated set-ups"
     " (experiments/atlas.yaml), with intervals. Nothing is extrapolated.",
-    epilog="example: tofpod ask --damage hole --size 5mm --distance 1m",
+    "tofpod ask --damage hole --size 5mm --distance 1m",
+    "tofpod ask --size 0.25in --distance 70cm --camera azure_kinect_nfov --frames 50",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -247,7 +242,7 @@ def _answer(
 
     size_mm = 1e3 * length_m("--size", options.size)
     distance_m = length_m("--distance", options.distance)
-    kind = KINDS.get(options.damage, options.damage)
+    kind = kind_called(options.damage)
     chosen = _chosen(options, surfaces, kind)
     values = _values(options, chosen, kind, distance_m)
     positions = _positions(values)
@@ -406,9 +401,9 @@ def _refuse_unknown(option: str, unknown: Sequence[str], in_atlas: Iterable[str]
 
 def _refuse_kind(damage: str, kind: str, in_atlas: Sequence[str]) -> None:
     """Raise UserError: the ``damage`` that the user named is of a ``kind`` not in the atlas."""
-    legal = [*(word for word, meant_kind in KINDS.items() if meant_kind in in_atlas), *in_atlas]
+    legal = [*(word for word, meant_kind in DAMAGE.items() if meant_kind in in_atlas), *in_atlas]
     raise UserError(
-        f"--damage {damage}: not in the atlas{_meant(kind, [*legal, *KINDS])}",
+        f"--damage {damage}: not in the atlas{_meant(kind, [*legal, *DAMAGE])}",
         legal=", ".join(legal),
         fix="run a study of damage that is not in the atlas, such as tofpod sweep crack",
     )

@@ -56,8 +56,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Render and simulate the views of an experiment, and write them with their true poses and "
     "damages as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and "
     "tf_static.",
-    epilog="example: tofpod export experiments/perspectives.yaml --format mcap --views 3 "
-    "--out bags/",
+    "tofpod export perspectives --format mcap --views 3 --out bags",
+    "tofpod export perspectives --format tum --frames 10 --hole-free --out sequence",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

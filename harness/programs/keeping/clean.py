@@ -25,7 +25,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("--all", action="store_true", help="cache: remove all renders")
     add(
-        "--out",
+        "--results",
         type=Path,
         default=Path("results"),
         metavar="DIR",
@@ -37,11 +37,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Remove stored renders or results. Only files that tofpod wrote below --out are "
+    "Remove stored renders or results. Only files that tofpod wrote below --results are "
     "removed, links are never "
     "followed, and files of a running sweep are kept.",
-    epilog="examples: tofpod clean cache --limit 5GB; "
-    "tofpod clean results averaging/69346a82f4194e03 --dry-run",
+    "tofpod clean cache --limit 5GB",
+    "tofpod clean results averaging --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for
@@ -67,10 +67,10 @@ def main(options: argparse.Namespace, command: str) -> int:
             legal="clean cache --limit SIZE, or --all",
         )
     if of_results:
-        folders = chosen_results(options.out, options.name)
+        folders = chosen_results(options.results, options.name)
         print("\n".join(map(str, folders)))
     else:
-        folders = [options.out / ".cache" / "renders"]
+        folders = [options.results / ".cache" / "renders"]
         if (limit is None) != options.all:
             raise UserError("no renders are selected for removal", legal="--limit SIZE, or --all")
         if not folders[0].is_dir():

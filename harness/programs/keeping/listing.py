@@ -1,4 +1,4 @@
-"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--out``,
+"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--results``,
 never behind a link."""
 
 import contextlib

@@ -51,6 +51,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Train the network of the detector `learned` on the damaged boards of an experiment: all its "
     "cameras, numbers of frames and kinds of damage. The same file, seed and machine give the "
     "same weights.",
+    "tofpod train training --out network.npz",
+    "tofpod train training --set study.boards=20 --passes 3 --out network.npz",
     epilog="Name the file in an experiment: detector: {name: learned, settings: {network: "
     "network.npz}}. Train on other boards and units than those that are judged.",
 )
