@@ -1,14 +1,13 @@
 """Loads an experiment from a YAML file and ``--set`` overrides, and reports all of its mistakes at
 once."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import ceil
 from pathlib import Path
 from typing import Any
 
 from harness.experiment import checks
+from harness.experiment.quick import quick_overrides
 from harness.experiment.schema import (
     DETECTOR_SETTINGS,
     Experiment,
@@ -28,7 +27,6 @@ from harness.vocabulary.declaration.yaml_source import (
 )
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
-from harness.vocabulary.path_names import UNKNOWNS
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
 from harness.vocabulary.words import nearest
 from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
@@ -36,9 +34,6 @@ from scenes.sensor.common.config import CameraConfig
 
 # Version of the resolved experiment in a result folder; raised when a key changes its meaning
 EXPERIMENT_VERSION = 1
-# Boards that set a threshold in a first look: 18 of the shipped size show one false call per m2,
-# of which 0.054 m2 are judged; two more for cameras whose outline takes more off
-QUICK_CALIBRATION_BOARDS = 20
 STAMP_KIND = "experiment"
 
 
@@ -51,8 +46,8 @@ def load_experiment(
 ) -> Experiment:
     """Read an experiment, apply ``path=value`` overrides, validate and unfold it. Raises
     DeclarationError with all problems. The lens of a recording ``calibration`` replaces the camera
-    file's nominal lens (`lens_numbers`). ``quick`` reduces repeats and boards and drops the
-    sensitivity study and a study's unknowns; ``overrides`` take precedence."""
+    file's nominal lens (`lens_numbers`). ``quick``: a first look (`quick_overrides`);
+    ``overrides`` take precedence."""
     recording_of.cache_clear()
     path = _experiment_file(Path(path))
     written = read_yaml(path)
@@ -64,7 +59,7 @@ def load_experiment(
             "that are then reported"
         )
         check_version(stamp, EXPERIMENT_VERSION, path, "an experiment", again=again)
-    overrides = [*_quick(written.data), *overrides] if quick else overrides
+    overrides = [*quick_overrides(written.data), *overrides] if quick else overrides
     source, problems = overridden(written, overrides, declared_of)
     source = _with_absolute_paths(source, path.resolve().parent)
     if calibration is not None:
@@ -83,33 +78,6 @@ def load_experiment(
         # override a varied preset
         data["detector"]["settings"] = shape.get(source.data, DETECTOR_SETTINGS) or {}
     return Experiment(config, points, data, source)
-
-
-def _quick(data: Any) -> list[str]:
-    """Return the overrides for a first look: at most 5 repeats, a third of a study's boards, no
-    sensitivity, and no unknowns of a study. A threshold keeps `QUICK_CALIBRATION_BOARDS` of its
-    boards, if it has as many."""
-    title = shape.get(data, ("title",)) or shape.get(data, ("name",))
-    overrides = [f"title={json.dumps(f'{title} (a first look)')}"]
-    overrides += ["sensitivity=null"] if shape.get(data, ("sensitivity",)) else []
-    # a third of the boards is too few to tell unknowns apart
-    if shape.get(data, ("study",)) and shape.get(data, (UNKNOWNS,)):
-        overrides.append(f"{UNKNOWNS}=[]")
-    for path in ("repeats", "threshold.calibrate.repeats"):
-        repeats = shape.get(data, tuple(path.split(".")))
-        if isinstance(repeats, int):
-            overrides.append(f"{path}={min(repeats, 5)}")
-    calibration_boards = "threshold.calibrate.boards"
-    for path in ("study.boards", "study.hole_free_boards", calibration_boards):
-        boards = shape.get(data, tuple(path.split(".")))
-        if isinstance(boards, int):
-            fewer = ceil(boards / 3)
-            if path == calibration_boards:
-                fewer = min(boards, max(fewer, QUICK_CALIBRATION_BOARDS))
-            if path == "study.boards" and shape.get(data, ("study", "precision")):
-                fewer = min(boards, max(fewer, checks.LEAST_BOARDS))
-            overrides.append(f"{path}={fewer}")
-    return overrides
 
 
 def _experiment_file(path: Path) -> Path:

@@ -259,8 +259,6 @@ DAMAGE = "#ff00ff"
 """Magenta, the colour of damage in the clouds of the thesis."""
 COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
 """Colours of lines, in order."""
-HIT = "#005b96"
-MISS = "#b34700"
 GUIDE = "#cfd6dd"
 """Colour of guides behind the data."""
 ON_IMAGE = "#10151b"
@@ -271,8 +269,6 @@ THEME = {
     GREY: "--grey",
     PALE: "--line",
     GUIDE: "--line",
-    HIT: "--yes",
-    MISS: "--no",
     BLUE: "--blue",
     ORANGE: "--orange",
     GREEN: "--green",

@@ -3,7 +3,6 @@ by class, and what was judged."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,16 @@ from markupsafe import Markup
 from detectors.interface import Detection
 from harness.records.examples import Scene3d
 from harness.report.blocks import command_of, fold, joined, origin_table, tag, template
-from harness.report.clouds import residual_norm
+from harness.report.clouds import (
+    SMALL_PX,
+    UNJUDGED_RGB,
+    css,
+    data_url,
+    residual_norm,
+    residual_rgb,
+    signed,
+    ticks_within,
+)
 from harness.report.findings import (
     Finding,
     Judged,
@@ -27,7 +35,6 @@ from harness.report.view3d import view3d_html
 from harness.vocabulary.geometry import MM, Cloud
 from harness.vocabulary.text import UNKNOWN_TEXT, Grid
 
-UNJUDGED_RGB = (185, 190, 196)
 PLAN_PX = 480
 """Longer side of the picture of a cloud without a pixel grid."""
 LEAST_RADIUS = 0.012
@@ -38,9 +45,6 @@ FEW = 25
 """Up to so many findings the numbers are large."""
 DEVIATION = "distance from the surface"
 """Name of the picture of residuals."""
-JPEG_QUALITY = 88
-SMALL_PX = 200
-"""Pictures up to this width are shown with sharp pixels."""
 
 
 @dataclass(frozen=True)
@@ -140,18 +144,8 @@ def deviation_view(judged: Judged) -> Picture:
     """Return the residuals in colours: red behind the surface, blue before it."""
     residual_mm = judged.evidence.residual_m / MM
     if judged.cloud.organised:
-        return cropped(judged, residual_rgb(residual_mm))
+        return cropped(judged, residual_rgb(residual_mm, residual_norm(residual_mm)))
     return _plan(judged, residual_mm)
-
-
-def residual_rgb(residual_mm: np.ndarray) -> np.ndarray:
-    """Return (h, w, 3) uint8: the common colours of residuals, grey where nothing was judged."""
-    from matplotlib import colormaps
-
-    shares = residual_norm(residual_mm)(np.nan_to_num(residual_mm))
-    rgb = np.rint(255 * colormaps["RdBu_r"](np.asarray(shares))[..., :3]).astype(np.uint8)
-    rgb[~np.isfinite(residual_mm)] = UNJUDGED_RGB
-    return np.asarray(rgb)
 
 
 def cropped(judged: Judged, rgb: np.ndarray) -> Picture:
@@ -183,7 +177,8 @@ def _plan(judged: Judged, residual_mm: np.ndarray) -> Picture:
     values_mm = residual_mm[is_judged]
     smallest_first = np.argsort(np.abs(values_mm))
     image[rows[smallest_first], columns[smallest_first]] = values_mm[smallest_first]
-    return Picture(residual_rgb(image), (float(low_mm[0]), float(low_mm[1])), side_mm)
+    rgb = residual_rgb(image, residual_norm(image))
+    return Picture(rgb, (float(low_mm[0]), float(low_mm[1])), side_mm)
 
 
 def numbered_picture(judged: Judged, picture: Picture, name: str) -> Markup:
@@ -277,30 +272,13 @@ def deviation_picture(judged: Judged) -> Markup:
     norm = residual_norm(residual_mm)
     limit_mm = float(norm.vmax or 0.0)
     ticks = []
-    for value_mm in (-100, -10, -1, 0, 1, 10, 100):
-        if abs(value_mm) <= limit_mm:
-            name = f"{value_mm:+d}".replace("-", "−") if value_mm else "0"
-            ticks.append((name, round(100 * float(norm(value_mm)), 1)))
+    for value_mm in ticks_within(limit_mm):
+        ticks.append((signed(value_mm), round(100 * float(norm(value_mm)), 1)))
     stops = np.linspace(-limit_mm, limit_mm, 256)
     evenly = np.interp(np.linspace(0, 1, 11), np.asarray(norm(stops)), stops)
-    colours = []
-    for red, green, blue in residual_rgb(evenly[None])[0] if limit_mm else []:
-        colours.append(f"rgb({red},{green},{blue})")
+    colours = [css(rgb) for rgb in residual_rgb(evenly, norm)]
     key = template("residual_key.html").render(ticks=ticks, colours=", ".join(colours))
     return tag("div", picture, Markup(key), kind="deviation")
-
-
-def data_url(rgb: np.ndarray) -> str:
-    """Return a picture as text: JPEG, or PNG if it is small."""
-    import cv2
-
-    bgr = np.ascontiguousarray(rgb[..., ::-1])
-    small = max(rgb.shape[:2]) <= SMALL_PX
-    ending = ".png" if small else ".jpg"
-    options = [] if small else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    _, encoded = cv2.imencode(ending, bgr, options)
-    kind = "png" if small else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(encoded.tobytes()).decode('ascii')}"
 
 
 # ---------------------------------------------------------------- tables

@@ -126,5 +126,5 @@ def age_sentence(name: str, ledger: Ledger) -> str:
         maker = f" by tofpod {entry.tofpod}" if entry.tofpod else ""
         return f"*Older than the code: computed on {entry.made}{maker}.*"
     if is_quick(name, ledger):
-        return "*From a quick run: fewer boards or repeats, so wider intervals.*"
+        return "*From a quick run: fewer boards, repeats or set-ups, so wider intervals.*"
     return ""

@@ -1,5 +1,6 @@
 """Makes artefacts again: runs their commands, stores their files, and keeps the ledger."""
 
+import json
 import shlex
 import shutil
 import subprocess
@@ -18,6 +19,8 @@ from harness.programs.artefacts.ledger import (
 )
 from harness.programs.artefacts.quoted import stored_rows
 from harness.vocabulary import provenance
+from harness.vocabulary.declaration import shape
+from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_bytes, write_text
 
@@ -100,6 +103,14 @@ def _has_quick_form(name: str) -> bool:
     return any(shlex.split(command)[:2] == SWEEP for command in artefact_named(name).commands)
 
 
+def _with_all_set_ups(experiment: str) -> list[str]:
+    """Return the options by which a quick run keeps all values of its axes: documents quote set-ups
+    by name."""
+    written = read_yaml(provenance.ROOT / experiment).data
+    sweep = shape.get(written, ("sweep",)) or {}
+    return ["--set", f"sweep={json.dumps(sweep)}"]
+
+
 def _run(command: str, *, quick: bool) -> None:
     """Run a command in the repository; its output goes to this terminal. Raises UserError if it
     ends with an error."""
@@ -108,7 +119,7 @@ def _run(command: str, *, quick: bool) -> None:
     if program == "tofpod":
         arguments = [sys.executable, "-m", "harness", *words]
         if quick and [program, words[0]] == SWEEP:
-            arguments.append("--quick")
+            arguments += ["--quick", *_with_all_set_ups(words[1])]
     if program == "python":
         arguments = [sys.executable, *words]
     code = subprocess.run(arguments, cwd=provenance.ROOT, check=False).returncode

@@ -12,8 +12,11 @@ import pytest
 
 from detectors.crop import BoxCrop
 from detectors.methods.thesis import ThesisConfig
+from harness.experiment import quick
 from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.schema import MAIN, Experiment, Point, SimulatedSource
+from harness.runs.plan import plan_of
+from harness.trials.learning import LEARNING_BOARDS
 from harness.vocabulary.geometry import MM, transform_points
 
 FOLDER = Path(__file__).resolve().parents[3] / "experiments"
@@ -71,14 +74,40 @@ def test_a_quick_run_has_few_repeats_or_boards_and_says_that_it_is_a_first_look(
 
 
 def test_a_quick_run_keeps_the_boards_that_its_threshold_needs() -> None:
-    quick = load_experiment(FOLDER / "detectors.yaml", quick=True).config
-    assert quick.threshold.calibrate is not None
-    assert quick.threshold.calibrate.boards == 20  # a third of 38 is 13, which cannot show the rate
+    first = load_experiment(FOLDER / "detectors.yaml", quick=True).config
+    assert first.threshold.calibrate is not None
+    assert first.threshold.calibrate.boards == 20  # a third of 38 is 13, which cannot show the rate
 
 
 @pytest.mark.parametrize("file", sorted(FOLDER.glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_shipped_experiment_has_a_quick_run(file: Path) -> None:
-    assert load_experiment(file, quick=True).points
+def test_the_quick_run_of_every_shipped_experiment_is_small(file: Path, tmp_path: Path) -> None:
+    first_look = load_experiment(file, quick=True)
+    plan = plan_of(first_look, tmp_path)
+    teaching = sum(len(group.learning) for group in plan.groups)
+    views = len(plan.renders) - LEARNING_BOARDS * teaching
+    assert views <= quick.MOST_VIEWS
+    set_ups = {point.variant for point in first_look.points}
+    boards = views if first_look.config.study else 2 * quick.MOST_REPEATS
+    sources = max(len({point.frames_key for point in first_look.points}), 1)
+    assert len(set_ups) * boards / sources <= quick.MOST_JUDGEMENTS
+
+
+def test_a_quick_run_has_the_ends_of_long_axes() -> None:
+    today = load_experiment(FOLDER / "today.yaml", quick=True).config
+    assert today.sweep["source.camera.name"] == ("azure_kinect_nfov", "vzense_ds86")
+    assert today.sweep["source.target.distance_m"] == (0.5, 1.5)
+    assert today.sweep["detector.name"] == ("thesis", "matched")  # on the same views
+    assert today.sweep["capture.frames"] == (1, 50)
+    perspectives = load_experiment(FOLDER / "perspectives.yaml", quick=True).config
+    assert perspectives.sweep["mapping.views"] == (1, 3, 9)
+    written = ["sweep.source.target.distance_m=[0.5, 1.0, 1.5]"]
+    asked = load_experiment(FOLDER / "today.yaml", written, quick=True).config
+    assert asked.sweep["source.target.distance_m"] == (0.5, 1.0, 1.5)
+
+
+def test_a_quick_run_has_few_draws() -> None:
+    draws = load_experiment(FOLDER / "thesis_inference.yaml", quick=True).config.draws
+    assert draws == quick.MOST_VIEWS // 2  # each has a view with and one without damage
 
 
 def test_every_variation_of_averaging_changes_something() -> None:

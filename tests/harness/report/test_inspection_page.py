@@ -18,6 +18,7 @@ import pytest
 from detectors.interface import Detection, Evidence, Measurement
 from harness import detect
 from harness.report.blocks import split_answer
+from harness.report.clouds import residual_norm, residual_rgb
 from harness.report.findings import Judged, Remark
 from harness.report.inspection_page import (
     best_view,
@@ -25,7 +26,6 @@ from harness.report.inspection_page import (
     deviation_picture,
     deviation_view,
     numbered_picture,
-    residual_rgb,
 )
 from harness.vocabulary.geometry import Cloud, Region
 from tests.support import recorded_plane as plane
@@ -110,7 +110,8 @@ def test_a_cloud_without_a_grid_is_drawn_in_its_plan_view() -> None:
 
 
 def test_red_is_behind_blue_before_and_grey_was_not_judged() -> None:
-    behind, before, nothing = residual_rgb(np.array([[5.0, -5.0, np.nan]]))[0]
+    residual_mm = np.array([5.0, -5.0, np.nan])
+    behind, before, nothing = residual_rgb(residual_mm, residual_norm(residual_mm))
     assert behind[0] > 2 * behind[2] and before[2] > 2 * before[0]
     assert tuple(nothing) == (185, 190, 196)
     key = str(deviation_picture(judged_of()))
