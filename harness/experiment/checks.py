@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
+from detectors.filters import filter_names
 from harness.experiment.schema import (
     CaptureSource,
     ExperimentConfig,
@@ -35,6 +36,7 @@ from scenes.target.thesis import AnyTargetConfig
 
 CAMERA_NAME = ("source", "camera", "name")
 DETECTOR_NAME = ("detector", "name")
+FILTER_NAME = ("capture", "filter", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
@@ -45,7 +47,12 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     """Validate an experiment's data; return its declaration (None if it is not valid) and all
     problems."""
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
-    for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
+    choices = (
+        (CAMERA_NAME, camera_names()),
+        (DETECTOR_NAME, detector_names()),
+        (FILTER_NAME, filter_names()),
+    )
+    for path, legal in choices:
         name = shape.get(source.data, path)
         if path == CAMERA_NAME and isinstance(name, str) and is_camera_path(name):
             try:
