@@ -276,9 +276,10 @@ def filters(
     out: str | Path = "results",
     jobs: int = 1,
 ) -> pd.DataFrame:
-    """State what filters cost, as ``tofpod filters`` does, and return its table (`results/README.md`
-    describes it). ``filters`` are names, YAML with settings, or functions as in `filtered`, which
-    run in this process; none: those of the experiment. Raises UserError as `sweep`.
+    """State what filters cost, as ``tofpod filters`` does, and return its table, which
+    `results/README.md` describes. ``filters`` are names, YAML with settings, or functions as in
+    `filtered`, which run in this process; none: those of the experiment. Raises UserError as
+    `sweep`.
 
     >>> tofpod.filters("medain")
     Traceback (most recent call last):

@@ -30,8 +30,9 @@ class HoleFillingConfig(Config):
 
 @dataclass(frozen=True)
 class HoleFillingFilter:
-    """Fills missing pixels from their neighbours, row by row, so that what is filled fills the
-    next (librealsense)."""
+    """Gives missing pixels a neighbour's depth (librealsense).
+
+    It works row by row, so that what is filled fills the next."""
 
     settings: HoleFillingConfig
     """Its settings."""

@@ -23,9 +23,11 @@ class MedianConfig(Config):
 
 @dataclass(frozen=True)
 class MedianFilter:
-    """Takes the median of a square (OpenCV's ``medianBlur``). A missing pixel counts as 0, as in
-    the stored picture: gaps that fill less than half of the square close with too near a depth,
-    larger ones grow at corners. Pixels beyond the border repeat those on it."""
+    """Takes the median of a square (OpenCV's ``medianBlur``).
+
+    A missing pixel counts as 0, as in the stored picture: gaps that fill less than half of the
+    square close with too near a depth, larger ones lose corners. Pixels beyond the border repeat
+    those on it."""
 
     settings: MedianConfig
     """Its settings."""

@@ -46,14 +46,16 @@ class TemporalConfig(Config):
 
 @dataclass(frozen=True)
 class TemporalFilter:
-    """Averages each pixel exponentially over frames, and keeps depth that goes missing
-    (librealsense). The first frame has no history and passes unchanged."""
+    """Averages pixels exponentially over frames and keeps depth that goes missing (librealsense).
+
+    The first frame has no history and passes unchanged."""
 
     settings: TemporalConfig
     """Its settings."""
     settings_type = TemporalConfig
     name = "temporal"
     version = 1
+    remembers_frames = True
 
     def started(self, unit_m: float, *, whole: bool) -> DepthFunction:
         """Return the function with an empty history."""

@@ -6,14 +6,18 @@ boards."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from detectors.filters import filter_settings_type
 from harness.evaluation.intervals import UNKNOWN, Interval, bootstrap, percentiles
 from harness.evaluation.study.limit import SetUpLimit
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.path_names import in_words, value_text
 
 if TYPE_CHECKING:
@@ -136,9 +140,15 @@ def _cost(
 
 
 def filter_text(declared: Mapping[str, Any]) -> str:
-    """Return a filter in words: its name, settings that were stated, and what it acts on if not
-    frames."""
-    shown = {"name": declared["name"], **declared.get("settings", {})}
+    """Return a filter in words: its name, settings that differ from its defaults, and what it acts
+    on if not frames."""
+    defaults: Mapping[str, Any] = {}
+    # a plug-in may be gone, or have settings without defaults
+    with contextlib.suppress(UserError, ValidationError):
+        defaults = filter_settings_type(declared["name"])().to_data()
+    settings = declared.get("settings", {})
+    chosen = {key: value for key, value in settings.items() if value != defaults.get(key)}
+    shown = {"name": declared["name"], **chosen}
     if declared.get("acts_on", "frames") != "frames":
         shown["on"] = declared["acts_on"]
     return value_text(AXIS, shown).replace("_", " ")

@@ -21,7 +21,7 @@ from harness.report.blocks import (
     page,
     svg,
 )
-from harness.vocabulary.text import Grid, many
+from harness.vocabulary.text import Grid, many, size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,13 +54,15 @@ def answer(costs: Sequence[FilterCost]) -> str:
     """State the largest clear loss and gain of a90 in a sentence each."""
     filtered = [cost for cost in costs if cost.is_filtered]
     lost, won = clear_changes(filtered)
+    if not lost and not won:
+        return "No filter changes the smallest hole found beyond the study's precision."
     sentences = []
-    if lost:
-        sentences.append(f"Largest loss: {_clause(lost[0])}.")
     if won:
         sentences.append(f"Largest gain: {_clause(won[0])}.")
-    if not sentences:
-        return "No filter changes the smallest hole found beyond the study's precision."
+    else:
+        sentences.append("No filter finds smaller holes.")
+    if lost:
+        sentences.append(f"Largest loss: {_clause(lost[0])}.")
     unclear = len(filtered) - len(lost) - len(won)
     if unclear:
         sentences.append(f"Of {many(len(filtered), 'change')}, {unclear} cannot be told from none.")
@@ -69,9 +71,9 @@ def answer(costs: Sequence[FilterCost]) -> str:
 
 def _clause(cost: FilterCost) -> str:
     """Return filter, place and change as the end of a sentence."""
-    before_mm = cost.without.a90_mm
-    now_mm = cost.limit.a90_mm
-    return f"{cost.filter_name}, {before_mm:.2f} to {now_mm:.2f} mm ({cost.place})"
+    before = size(cost.without.a90_mm, cost.without.largest_mm)
+    now = size(cost.limit.a90_mm, cost.limit.largest_mm)
+    return f"{cost.filter_name}, a90 from {before} to {now} mm ({cost.place})"
 
 
 def changes_figure(costs: Sequence[FilterCost]) -> str:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from harness.programs.filters.costs import FilterCost
 from harness.records.schema import Column, Estimate, Table
 from harness.tables.limits import CALLS, FOUND_90, a90_of
@@ -11,16 +15,10 @@ PAIRED = "95 % interval over boards, which both set-ups share"
 
 
 def _change(cost: FilterCost) -> Estimate:
-    """Return the change of a90."""
+    """Return the change of a90, which is known up to the largest size inspected."""
     interval = cost.change_interval_mm
-    return Estimate(cost.change_mm, interval.low, interval.high)
-
-
-def _change_text(change: Estimate) -> str:
-    """Return ``+0.31 (+0.10 to +0.60)``, or a dash without a filter."""
-    if not change.low == change.low or not change.value == change.value:
-        return text.UNKNOWN_TEXT
-    return f"{change.value:+.2f} ({change.low:+.2f} to {change.high:+.2f})".replace("-", "−")
+    most_mm = cost.limit.largest_mm - cost.without.a90_mm
+    return Estimate(cost.change_mm, interval.low, interval.high, most_mm)
 
 
 def _bias(cost: FilterCost, measure: str) -> Estimate:
@@ -29,16 +27,28 @@ def _bias(cost: FilterCost, measure: str) -> Estimate:
     return Estimate(bias.mean_mm, bias.interval_mm.low, bias.interval_mm.high)
 
 
-def _bias_text(bias: Estimate) -> str:
-    """Return a signed number of millimetres, or a dash."""
-    if bias.value != bias.value:
+def _signed(estimate: Estimate) -> str:
+    """Return ``+0.31 (+0.10 to +0.60)``, ``> +5.00`` beyond what is known, or a dash."""
+    if estimate.value > estimate.most:
+        return f"> {estimate.most:+.2f}"
+    if not np.isfinite(estimate.value):
         return text.UNKNOWN_TEXT
-    return f"{bias.value:+.2f} ({bias.low:+.2f} to {bias.high:+.2f})".replace("-", "−")
+    signed = f"{estimate.value:+.2f}"
+    if np.isfinite([estimate.low, estimate.high]).all():
+        signed += f" ({estimate.low:+.2f} to {estimate.high:+.2f})"
+    return signed.replace("-", "\N{MINUS SIGN}")
 
 
 def _short(estimate: Estimate) -> str:
     """Return the number without its interval, for a terminal."""
-    return _bias_text(estimate).partition(" ")[0]
+    return _signed(estimate).partition(" ")[0]
+
+
+def _tone(cost: FilterCost) -> text.Tone:
+    """Return the colour of a change that is clearly a loss or a gain."""
+    if cost.change_interval_mm.low > 0:
+        return "bad"
+    return "key" if cost.change_interval_mm.high < 0 else ""
 
 
 FILTER_COSTS = Table(
@@ -58,14 +68,16 @@ FILTER_COSTS = Table(
             "change (mm)",
             _change,
             f"a90 less that without a filter, with its {PAIRED}",
-            _change_text,
+            _signed,
             interval=True,
-            tone=lambda row: _tone(row),
+            tone=_tone,
         ),
         Column("lost", "", "lost", "inspections in which damage is found without the filter only"),
         Column("gained", "", "gained", "inspections in which it is found with the filter only"),
-        CALLS[0],
-        CALLS[1],
+        replace(
+            CALLS[0], value=("limit.false_calls.rate_per_m2", "limit.false_calls.interval_per_m2")
+        ),
+        replace(CALLS[1], value="limit.false_calls.calls"),
         Column("threshold", "", "limit.record.threshold", "threshold learned on hole-free boards"),
         Column(
             "",
@@ -85,7 +97,7 @@ FILTER_COSTS = Table(
             "diameter bias (mm)",
             lambda row: _bias(row, "diameter"),
             "mean of measured less true diameter of the hits, with its 95 % interval over boards",
-            _bias_text,
+            _signed,
             interval=True,
             brief=_short,
         ),
@@ -94,7 +106,7 @@ FILTER_COSTS = Table(
             "depth bias (mm)",
             lambda row: _bias(row, "depth"),
             "the same of the depth",
-            _bias_text,
+            _signed,
             interval=True,
             brief=_short,
         ),
@@ -103,10 +115,3 @@ FILTER_COSTS = Table(
     title="filters: limits, and changes against no filter",
     left=2,
 )
-
-
-def _tone(cost: FilterCost) -> text.Tone:
-    """Return the colour of a change that is clearly a loss or a gain."""
-    if cost.change_interval_mm.low > 0:
-        return "bad"
-    return "key" if cost.change_interval_mm.high < 0 else ""
