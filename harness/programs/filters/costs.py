@@ -75,6 +75,11 @@ class FilterCost:
         """Return whether the set-up has a filter."""
         return self.filter_name != NO_FILTER
 
+    @property
+    def most_mm(self) -> float:
+        """The largest change that inspections support: up to the largest size inspected."""
+        return self.limit.largest_mm - self.without.a90_mm
+
 
 def costs_of(
     limits: Sequence[SetUpLimit], holes: pd.DataFrame, runs: pd.DataFrame

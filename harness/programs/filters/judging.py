@@ -58,6 +58,6 @@ def judged_filters(folder: Path, command: str) -> list[FilterCost]:
     }
     write_tables(folder, {FILTER_COSTS: FILTER_COSTS.frame(costs)}, provenance)
     write_text(folder / FILTERS_PAGE.name, filters_html(study, costs, command))
-    show(filters_parts(study, costs))
+    show(filters_parts(costs))
     print(f"page: {folder / FILTERS_PAGE.name}")
     return costs

@@ -97,10 +97,10 @@ def changes_figure(costs: Sequence[FilterCost]) -> str:
 
 
 def _reach_mm(cost: FilterCost) -> float:
-    """Return how far a change and its interval reach from 0, as far as they are known."""
+    """Return how far a change and its interval reach from 0, as far as inspections support."""
     interval = cost.change_interval_mm
-    ends_mm = np.abs([cost.change_mm, interval.low, interval.high])
-    return float(ends_mm[np.isfinite(ends_mm)].max(initial=0.1))
+    ends_mm = np.minimum([cost.change_mm, interval.low, interval.high], cost.most_mm)
+    return float(np.abs(ends_mm[np.isfinite(ends_mm)]).max(initial=0.1))
 
 
 def _draw_panel(axes: Axes, costs: Sequence[FilterCost], widest_mm: float) -> None:
@@ -113,19 +113,21 @@ def _draw_panel(axes: Axes, costs: Sequence[FilterCost], widest_mm: float) -> No
             colour = RED
         elif interval.high < 0:
             colour = BLUE
-        if np.isfinite(cost.change_mm):
-            ends_mm = np.clip([interval.low, interval.high], -widest_mm, widest_mm)
-            axes.plot(ends_mm, [row, row], color=colour, lw=1.6, label=cost.filter_name)
-            axes.plot(cost.change_mm, row, "o", color=colour, ms=5)
-        else:
-            axes.text(0, row, " no limit within the sizes", va="center", fontsize=9)
+        if not np.isfinite(cost.change_mm):
+            axes.text(0, row, " no limit", va="center", fontsize=9)
+            continue
+        ends_mm = np.clip([interval.low, interval.high], -widest_mm, cost.most_mm)
+        axes.plot(ends_mm, [row, row], color=colour, lw=1.6, label=cost.filter_name)
+        is_known = cost.change_mm <= cost.most_mm
+        marker = "o" if is_known else ">"
+        axes.plot(min(cost.change_mm, cost.most_mm), row, marker, color=colour, ms=5)
     axes.set_yticks(range(len(costs)), [cost.filter_name for cost in costs])
     axes.set(xlim=(-1.05 * widest_mm, 1.05 * widest_mm), ylim=(len(costs) - 0.5, -0.5))
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
 
 
-def filters_parts(study: StudyRecord, costs: Sequence[FilterCost]) -> list[str | Grid]:
+def filters_parts(costs: Sequence[FilterCost]) -> list[str | Grid]:
     """Return the parts for a terminal: the table and the answer."""
     return [FILTER_COSTS.grid(costs, terminal=True), "", answer(costs)]
 
@@ -138,8 +140,8 @@ def filters_html(study: StudyRecord, costs: Sequence[FilterCost], command: str) 
         f"{many(costs[0].limit.boards, 'board')} for each row, detector {detectors}."
     )
     caption = (
-        "Change of a90, the diameter found nine times out of ten, with its 95 % interval over "
-        "boards. Red: clearly worse; blue: clearly better."
+        "Change of a90, the size found nine times out of ten, with its 95 % interval over "
+        "boards. Red: clearly worse; blue: clearly better; arrow: beyond the sizes."
     )
     drawn = figure({"changes": changes_figure(costs)}, "changes", caption)
     body = [

@@ -17,8 +17,7 @@ PAIRED = "95 % interval over boards, which both set-ups share"
 def _change(cost: FilterCost) -> Estimate:
     """Return the change of a90, which is known up to the largest size inspected."""
     interval = cost.change_interval_mm
-    most_mm = cost.limit.largest_mm - cost.without.a90_mm
-    return Estimate(cost.change_mm, interval.low, interval.high, most_mm)
+    return Estimate(cost.change_mm, interval.low, interval.high, cost.most_mm)
 
 
 def _bias(cost: FilterCost, measure: str) -> Estimate:
