@@ -138,9 +138,9 @@ def plain_temporal(
 
 @pytest.mark.parametrize("mode", range(9))
 def test_temporal_is_the_vendors(mode: int):
-    frames = [depth_units(seed, (6, 7)) for seed in range(20)]
+    frames = [depth_units(seed, (6, 7)) for seed in range(30)]
     for number, frame in enumerate(frames):
-        frame[2, :3] = 0 if number % 9 > 2 else frame[2, :3]  # long gaps
+        frame[2, :3] = 0 if number % 14 > 3 else frame[2, :3]  # long gaps
     function = load_filter("temporal", {"holes_fill": mode, "filter_smooth_delta": 15}).started(
         UNIT_M, whole=True
     )
