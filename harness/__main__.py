@@ -91,6 +91,11 @@ PROGRAMS = (
         "writes a camera's noise as a table and a file of code",
     ),
     ProgramEntry(
+        "filters",
+        "harness.programs.filters.filters",
+        "states what a filter from depth to depth costs in detection limit, false calls and sizes",
+    ),
+    ProgramEntry(
         "flatfield",
         "harness.programs.camera.flatfield",
         "measures a unit's fixed pattern on captures of a flat surface",

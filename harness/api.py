@@ -36,12 +36,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from detectors import load_detector
 from detectors.averages.average import AverageConfig
 from detectors.averages.average import average as averaged
+from detectors.filters import functions_named, load_filter
+from detectors.filters.interface import DepthFilter, DepthFunction, FunctionFilter
+from detectors.filters.stream import FilteredFrames
 from detectors.recordings import open_capture
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import read_record
@@ -73,6 +77,8 @@ __all__ = [
     "UserError",
     "average",
     "detect",
+    "filtered",
+    "filters",
     "findings_table",
     "frames",
     "limits",
@@ -147,6 +153,25 @@ def load(*paths: str | Path, unit: str | None = None) -> FrameSource:
     reads. ``unit`` is that of the stored depth, such as ``mm`` or ``4000/m``, if the files do not
     state it. Raises UserError."""
     return open_capture([Path(path) for path in paths], unit=unit)
+
+
+def filtered(
+    frames: FrameSource, depth_filter: str | DepthFunction, **settings: Any
+) -> FrameSource:
+    """Return frames through a filter: one by name with its settings, or a function from z (h, w)
+    in metres, NaN where missing, to z of the same size. Raises UserError.
+
+    >>> smooth = tofpod.average(tofpod.filtered(tofpod.frames(unit, 3), "median", kernel_size=3))
+    >>> nearer = tofpod.filtered(tofpod.frames(unit, 3), lambda z_m: z_m - 0.1)
+    >>> nearer.region == smooth.region
+    True
+    """
+    chosen: DepthFilter
+    if isinstance(depth_filter, str):
+        chosen = load_filter(depth_filter, settings)
+    else:
+        chosen = FunctionFilter("function", depth_filter)
+    return FilteredFrames(frames, chosen)
 
 
 def average(frames: FrameSource, method: str = "mean", **settings: Any) -> Cloud:
@@ -242,6 +267,40 @@ def sweep(
             fix="correct the cause and run it again",
         )
     return loaded.folder(out)
+
+
+def filters(
+    *filters: str | DepthFunction,
+    experiment: str | Path = "filters",
+    changes: Sequence[str] = (),
+    out: str | Path = "results",
+    jobs: int = 1,
+) -> pd.DataFrame:
+    """State what filters cost, as ``tofpod filters`` does, and return its table, which
+    `results/README.md` describes. ``filters`` are names, YAML with settings, or functions as in
+    `filtered`, which run in this process; none: those of the experiment. Raises UserError as
+    `sweep`.
+
+    >>> tofpod.filters("medain")
+    Traceback (most recent call last):
+    ...
+    harness.vocabulary.declaration.yaml_source.DeclarationError: ...
+    """
+    # found by name: the core imports no program
+    judging = import_module("harness.programs.filters.judging")
+    functions = {}
+    names = []
+    for given in filters:
+        name = given if isinstance(given, str) else given.__name__
+        names.append(name)
+        if not isinstance(given, str):
+            functions[name] = given
+    with functions_named(functions):
+        overrides = [*changes, *([judging.filter_axis(names)] if names else [])]
+        judging.refuse_other_studies(load_experiment(Path(experiment), overrides))
+        folder = sweep(experiment, *overrides, out=out, jobs=1 if functions else jobs)
+    judging.judged_filters(folder, f"tofpod.filters(experiment={str(experiment)!r})")
+    return table(folder, "filters")
 
 
 def table(folder: str | Path, name: str) -> pd.DataFrame:

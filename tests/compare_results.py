@@ -50,7 +50,7 @@ class ExpectedDifference:
 
 
 PROGRAM = (
-    "ask|characterise|check|clean|compare|coverage|dataset|design|detect|efficiency|export_noise"
+    "ask|characterise|check|clean|compare|coverage|dataset|design|detect|efficiency|export_noise|filters"
     "|export|flatfield|gauge|implant|ls|merge|pod|prepare|score|sweep|target|validate"
 )
 PROVENANCE_ROWS = "commit|dirty|started|machine|renders|trials|peak mb|versions"

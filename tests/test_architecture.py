@@ -75,6 +75,7 @@ PROGRAMS_THAT_IMPORT_A_PROGRAM = {
     ("keeping", "atlas"): "`ls` and `clean` know the files that each program writes",
     ("keeping", "coverage"): "likewise",
     ("keeping", "efficiency"): "likewise",
+    ("keeping", "filters"): "likewise",
     ("keeping", "artefacts"): "`ls artefacts` lists the age of stored answers",
     ("scorecard", "camera"): "`validate --capture` measures a capture as `characterise` does",
 }

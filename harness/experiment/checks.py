@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
+from detectors.filters import FilterConfig, filter_names, load_filter
 from harness.experiment.schema import (
     CaptureSource,
     ExperimentConfig,
@@ -35,6 +36,7 @@ from scenes.target.thesis import AnyTargetConfig
 
 CAMERA_NAME = ("source", "camera", "name")
 DETECTOR_NAME = ("detector", "name")
+FILTER_NAME = ("capture", "filter", "name")
 CAMERA_NUMBERS = ("source", "camera", "numbers")
 TARGET = ("source", "target")
 VIEWS = ("source", "views")
@@ -45,7 +47,12 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
     """Validate an experiment's data; return its declaration (None if it is not valid) and all
     problems."""
     config, problems = validated(ExperimentConfig, source, splices_of(source.data))
-    for path, legal in ((CAMERA_NAME, camera_names()), (DETECTOR_NAME, detector_names())):
+    choices = (
+        (CAMERA_NAME, camera_names()),
+        (DETECTOR_NAME, detector_names()),
+        (FILTER_NAME, filter_names()),
+    )
+    for path, legal in choices:
         name = shape.get(source.data, path)
         if path == CAMERA_NAME and isinstance(name, str) and is_camera_path(name):
             try:
@@ -60,6 +67,9 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
         position = source.key_place_of(("capture", "average", "frames"))
         message = "the number of frames is set by"
         problems.append(Problem(f"{message} `capture.frames`", position, fix="remove this key"))
+    depth_filter = config.capture.filter
+    if depth_filter is not None:
+        problems += _filter_problems(depth_filter, source)
     if isinstance(config.source, SimulatedSource):
         for check in (_target_problems, _mapping_problems, _flat_field_problems):
             problems += check(config, config.source, source)
@@ -287,6 +297,15 @@ def _mapping_problems(
         yield Problem(
             f"{mapping.views} views, but source.views has {count}", position, legal=f"1 to {count}"
         )
+
+
+def _filter_problems(depth_filter: FilterConfig, source: Source) -> Iterator[Problem]:
+    """Report a filter over frames that is to act on an average, which is a single picture."""
+    loaded = load_filter(depth_filter.name, depth_filter.settings)
+    if depth_filter.acts_on == "average" and getattr(loaded, "remembers_frames", False):
+        position = source.place_of(("capture", "filter", "acts_on"))
+        message = f"the filter {depth_filter.name!r} changes nothing in a single picture"
+        yield Problem(message, position, legal="frames")
 
 
 def _flat_field_problems(

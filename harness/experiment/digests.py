@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from detectors import DETECTORS
+from detectors.filters import filter_module
 from harness.experiment.schema import Experiment, SimulatedSource
 from harness.vocabulary.code_digests import DIGITS, Digests, code_digests
 from harness.vocabulary.seeds import digest
@@ -29,6 +30,7 @@ def experiment_digests(experiment: Experiment) -> Digests:
     simulated = [source for source in sources if isinstance(source, SimulatedSource)]
     digests = simulation_digests(
         detectors={point.config.detector.name for point in experiment.points},
+        filters=_filters_of(experiment),
         cameras={source.camera.name for source in simulated},
         several_views=any(source.views is not None for source in simulated),
     )
@@ -38,12 +40,23 @@ def experiment_digests(experiment: Experiment) -> Digests:
     return digests
 
 
+def _filters_of(experiment: Experiment) -> set[str]:
+    """Return the names of the filters that an experiment uses."""
+    chosen = [point.config.capture.filter for point in experiment.points]
+    return {config.name for config in chosen if config is not None}
+
+
 def simulation_digests(
-    detectors: Iterable[str], cameras: Iterable[str], *, several_views: bool = False
+    detectors: Iterable[str],
+    cameras: Iterable[str],
+    *,
+    filters: Iterable[str] = (),
+    several_views: bool = False,
 ) -> Digests:
-    """Return the digests of the code that simulates and judges with these detectors and cameras,
-    and of the cameras' numbers. Rooms of which such a run uses nothing are left out."""
+    """Return the digests of the code that simulates and judges with these detectors, filters and
+    cameras, and of the cameras' numbers. Rooms of which such a run uses nothing are left out."""
     modules = [DETECTORS.offer(name).target.partition(":")[0] for name in detectors]
+    modules += [module for name in filters if (module := filter_module(name)) is not None]
     names = set(cameras)
     kinds = {type(load_camera(name)).__module__.rpartition(".")[0] for name in names}
     unused = [room for room in KINDS if room.replace("/", ".") not in kinds]

@@ -18,11 +18,18 @@ from pydantic import BeforeValidator, Field, model_validator
 from detectors import DETECTORS, detector_names, detector_type
 from detectors.averages.average import AverageConfig
 from detectors.averages.flat_field import FlatFieldConfig
+from detectors.filters import (
+    FilterConfig,
+    filter_names,
+    filter_origin,
+    filter_settings_type,
+    load_filter,
+)
 from detectors.views.mapping.settings import MappingConfig
 from harness.experiment.unknowns import UnknownConfig
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration import shape
-from harness.vocabulary.declaration.yaml_source import Source
+from harness.vocabulary.declaration.yaml_source import KeyPath, Source
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import file_digest, inside
 from harness.vocabulary.path_names import UNKNOWNS
@@ -96,6 +103,7 @@ class CaptureConfig(Config):
         None,
         description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
+    filter: FilterConfig | None = Field(None, description="a filter from depth to depth")
 
 
 class DetectorConfig(Config):
@@ -310,14 +318,21 @@ class ExperimentConfig(Config):
 
 
 DETECTOR_SETTINGS = ("detector", "settings")
+FILTER_SETTINGS = ("capture", "filter", "settings")
 
 
 def splices_of(data: Any) -> shape.Splices:
-    """Return the path of the detector's settings and their model; empty for an unknown detector."""
+    """Return the paths of the settings of detector and filter, with their models; without those
+    that are unknown."""
+    splices: dict[KeyPath, type[Config]] = {}
     detector = shape.child(data, "detector")
     name = detector.get("name", "thesis") if isinstance(detector, dict) else "thesis"
-    is_known = isinstance(name, str) and name in detector_names()
-    return {DETECTOR_SETTINGS: detector_type(name).settings_type} if is_known else {}
+    if isinstance(name, str) and name in detector_names():
+        splices[DETECTOR_SETTINGS] = detector_type(name).settings_type
+    filter_name = shape.get(data, (*FILTER_SETTINGS[:-1], "name"))
+    if isinstance(filter_name, str) and filter_name in filter_names():
+        splices[FILTER_SETTINGS] = filter_settings_type(filter_name)
+    return splices
 
 
 def declared_of(data: Any) -> shape.Declared:
@@ -441,6 +456,7 @@ def point_of(
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}
+    numbers["capture"] = _capture_numbers(config.capture)
     return Point(
         label,
         variant,
@@ -449,6 +465,18 @@ def point_of(
         digest(numbers),
         digest({"source": frames, "seed": config.seed}),
     )
+
+
+def _capture_numbers(capture: CaptureConfig) -> dict[str, Any]:
+    """Return what of the frames' way into the average decides numbers. Without a filter there is
+    no key for one, so that results from before there were filters keep their digests."""
+    numbers = capture.to_data()
+    if capture.filter is None:
+        del numbers["filter"]
+        return numbers
+    name = capture.filter.name
+    version = load_filter(name, capture.filter.settings).version
+    return {**numbers, "filter_version": version, "filter_from": filter_origin(name)}
 
 
 def detector_version(config: ExperimentConfig) -> int:

@@ -38,6 +38,9 @@ COMPARISON_PAGE = Output("compare.html", "the comparison as a page", of="check")
 EFFICIENCY_PAGE = Output(
     "efficiency.html", "detectors compared with the ideal observer", of="efficiency"
 )
+FILTERS_PAGE = Output(
+    "filters.html", "what filters cost: changes of limits, false calls and sizes", of="filters"
+)
 COVERAGE_PAGE = Output(
     "coverage.html", "the part in 3-D, coloured by the size of damage that is found", of="coverage"
 )
@@ -79,6 +82,7 @@ FILES = (
     COMPARISON,
     COMPARISON_PAGE,
     EFFICIENCY_PAGE,
+    FILTERS_PAGE,
     COVERAGE_PAGE,
     ATLAS_PAGE,
     ATLAS_PICTURE,

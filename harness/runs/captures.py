@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from detectors import load_detector
-from detectors.averages.average import prefix_averages
+from detectors.filters.stream import averages_through
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import CaptureSource, Experiment, recording_of
 from harness.inspection.judging import judged
@@ -37,8 +37,9 @@ def judge_captures(experiment: Experiment, out: Path, command: str) -> int:
         assert isinstance(config.source, CaptureSource)
         assert k is not None  # the checks of experiments refuse to calibrate on a capture
         recording = recording_of(config.source)
-        frames = config.capture.frames
-        cloud = prefix_averages(recording, [frames], config.capture.average)[frames]
+        capture = config.capture
+        counts = [capture.frames]
+        (cloud,) = averages_through(recording, counts, capture.average, capture.filter).values()
         detector = load_detector(config.detector.name, dict(config.detector.settings))
         choice = choice_by(getattr(detector, "settings", None), cloud)
         result = judged(detector, cloud, detector.analyse(cloud), k)

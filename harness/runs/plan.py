@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from detectors import DETECTORS
+from detectors.filters import BUILT_IN, filter_module
 from detectors.interface import Calibratable
 from harness.evaluation.study.record import BoardDesign
 from harness.experiment.schema import Experiment, Point, SimulatedSource, StudyConfig
@@ -51,14 +52,15 @@ PACKAGES = (
 )
 """A trial runs again after a change of its task, of sources that it reaches, or of a version of
 these packages."""
+BUILT_IN_FILTERS = tuple(target.partition(":")[0] for target in BUILT_IN.values())
 MOST_REPEATS = 256  # repeats in one part of a plan; a part is looked up and queued as a whole
 
 
 def trial_code(detector: str) -> tuple[str, ...]:
     """Return the modules whose sources determine a trial with a detector, including those of a
-    plug-in."""
+    plug-in and of all built-in filters."""
     module, _, _ = DETECTORS.offer(detector).target.partition(":")
-    return (CODE, module)
+    return (CODE, *BUILT_IN_FILTERS, module)
 
 
 @dataclass(frozen=True)
@@ -256,6 +258,7 @@ class Group:
         detectors = sorted({point.criteria.detector for point in trial.points})
         content: list[Any] = [JOURNAL_VERSION]
         content += [source_digest(trial_code(name), PACKAGES) for name in detectors]
+        content += [source_digest((module,), PACKAGES) for module in foreign_filters(trial)]
         content += [path.stem for path in batch.paths]
         content += [
             None if self.poses is None else self.poses.to_data(),
@@ -267,6 +270,13 @@ class Group:
         ]
         number = trial.repeat if trial.board is None else trial.board
         return f"{trial.role}-{number:05d}-{digest(content)}"
+
+
+def foreign_filters(trial: Trial) -> list[str]:
+    """Return the modules of the plug-ins among the filters of a trial, sorted."""
+    chosen = [point.averaging.filter for point in trial.points]
+    modules = {filter_module(config.name) for config in chosen if config is not None}
+    return sorted(module for module in modules - {*BUILT_IN_FILTERS} if module is not None)
 
 
 def _point_key(point: TrialPoint) -> list[Any]:
@@ -281,11 +291,17 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
     """Return a point's part of a trial. ``threshold``: None during calibration. ``learned``: file
     of what its detector has learned."""
     config = point.config
+    depth_filter = config.capture.filter
+    averaging = Averaging(
+        config.capture.average,
+        config.capture.flat_field,
+        None if depth_filter is None else canonical_json(depth_filter.to_data()),
+    )
     return TrialPoint(
         digest=point.digest,
         variant=point.variant,
         frames=config.capture.frames,
-        averaging=Averaging(config.capture.average, config.capture.flat_field),
+        averaging=averaging,
         criteria=Criteria(
             detector=config.detector.name,
             settings_json=canonical_json(config.detector.settings),

@@ -3,8 +3,8 @@ maps.
 
 A map is judged like a detector's score in a study. The threshold is the lowest with the wanted
 rate of false calls on the good boards of ``validation``. Pixels above it that are connected by
-steps of at most `LINK_M` form a finding, which hits a damage by the experiment's rule
-(`harness.trials.judge.matched`). Limits follow from ``test``. Only inspected pixels count.
+short steps form a finding, which hits a damage by the set's rule (`harness.trials.judge.matched`).
+Limits follow from ``test``. Only inspected pixels count.
 
 AU-PRO is the area under the mean overlap of damages against the share of false pixels, up to
 `PRO_LIMIT` and divided by `PRO_LIMIT` (Bergmann et al., Int. Journal of Computer Vision 129
@@ -29,13 +29,13 @@ from harness.vocabulary.seeds import digest
 if TYPE_CHECKING:
     from detectors.score_map import Findings
     from harness.evaluation.study.limit import SetUpLimit
+    from harness.programs.dataset.judged_sets import JudgedPicture, JudgedSet
 
 ENDINGS = (".npy", ".tiff", ".tif")
-JUDGED = ("validation", "test")  # splits whose boards all need a map
-LINK_M = 0.010  # longest step within a finding, as in `detectors.score_map`
 PRO_LIMIT = 0.3
 MOST_NAMED = 3
-JUDGED_BY = ("inspected", "board_xy_m", "damage")
+CALLING_SHARE = 0.1
+"""Share of good pictures that may call, where the data set states no rate of false calls."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +46,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="a folder that tofpod dataset wrote",
+        help="a folder that tofpod dataset wrote, or one in the layout of MVTec 3D-AD",
     )
-    rate = "wanted false calls per square metre, which sets the threshold (default: the data set's)"
+    rate = (
+        "wanted false calls per square metre, which sets the threshold (default: the data set's, "
+        "or those with which one good picture in ten calls)"
+    )
     add("--false-calls-per-m2", type=float, metavar="RATE", help=rate)
     add(
         "--name",
@@ -69,7 +72,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "State the detection limit (a90, a90/95) of anomaly maps on a data set of tofpod dataset, "
     "with AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
     "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for "
-    "likely damage.",
+    "likely damage. In the layout of MVTec 3D-AD, sizes are those of circles with the area of "
+    "each region of a mask, and maps of validation may be left out.",
     "tofpod score maps --dataset boards --out scores",
     "tofpod score maps --dataset boards --name ours --out scores",
     epilog="tofpod compare compares two such folders of results.",
@@ -77,37 +81,29 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
     from harness.evaluation.study.record import StudyRecord, record_text
-    from harness.programs.dataset.boards import read_index
     from harness.records.schema import write_table
     from harness.report.pod import pod_html
     from harness.tables.limits import LIMITS, SCORES
     from harness.vocabulary.text import show
 
-    index = read_index(options.dataset)
-    if index["samples"] is None:
-        raise UserError(
-            f"{options.dataset}: is not finished",
-            fix="run the command that wrote it again; it continues",
-        )
-    rate = (
-        index["false_calls_per_m2"]
-        if options.false_calls_per_m2 is None
-        else options.false_calls_per_m2
-    )
-    if not 0 < rate <= 1e6:
+    data = _opened(options.dataset)
+    rate = options.false_calls_per_m2
+    if rate is None:
+        rate = data.false_calls_per_m2
+    if rate is not None and not 0 < rate <= 1e6:
         raise UserError(
             f"--false-calls-per-m2 {rate:g}", legal="above 0, up to 1e6 per square metre"
         )
-    maps = _found(options.predictions, options.dataset, index["samples"])
-    judged = [_judged(category, maps, options, index, rate) for category in index["categories"]]
+    maps = _found(options.predictions, data)
+    judged = [_judged(category, maps, options, data, rate) for category in data.categories]
     limits = [limit for limit, _ in judged]
     rows = [row for _, row in judged]
     origin = record(command)
     study = StudyRecord(
-        name=index["name"],
-        digest=digest([index["content"], options.name, rate]),
-        hit_radius_mm=index["hit_radius_mm"],
-        hit_overlap=index["hit_overlap"],
+        name=data.name,
+        digest=digest([data.content, options.name, rate]),
+        hit_radius_mm=data.hit_radius_mm,
+        hit_overlap=data.hit_overlap,
         false_calls_per_m2=rate,
         provenance={key: origin[key] for key in ("commit", "dirty", "versions", "command")},
         set_ups=tuple(limit.record for limit in limits),
@@ -119,25 +115,41 @@ def main(options: argparse.Namespace, command: str) -> int:
         if limit.statement is not None:
             page = options.out / f"{limit.record.variant}.html"
             write_text(page, pod_html(limit.statement, command))
-    single = [name for name, facts in index["categories"].items() if facts["units"] == 1]
+    single = [name for name, facts in data.categories.items() if facts["units"] == 1]
     if single:
         show([f"warning: the limit holds for one unit of the camera only: {', '.join(single)}"])
+    in_sample = [name for name in data.categories if data.quiet_split(name, list(maps)) == "test"]
+    if in_sample:
+        text = (
+            "warning: the threshold is set on the good pictures on which false calls are counted; "
+            f"write maps of validation/good too: {', '.join(in_sample)}"
+        )
+        show([text])
     show([LIMITS.grid(limits, terminal=True), "", SCORES.grid(rows, terminal=True)])
     print(f"wrote {options.out}: study.json, limits.csv, scores.csv, a page for each curve")
     return 0
 
 
-def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Path]:
-    """Return the file of each board's map. Raises a UserError that names all missing, extra or
-    wrong files."""
-    from harness.programs.dataset.boards import read_arrays
+def _opened(folder: Path) -> JudgedSet:
+    """Open a data set of either layout. Raises UserError."""
+    from harness.programs.dataset.boards import INDEX
+    from harness.programs.dataset.judged_sets import BoardSet
+    from harness.programs.dataset.mvtec import MvtecSet, is_mvtec
 
-    wanted = {name for name in samples if name.split("/")[1] in JUDGED}
+    if not (folder / INDEX).is_file() and is_mvtec(folder):
+        return MvtecSet(folder)
+    return BoardSet(folder)
+
+
+def _found(predictions: Path, data: JudgedSet) -> dict[str, Path]:
+    """Return the file of each picture's map. Raises a UserError that names all missing, extra or
+    wrong files."""
     files: dict[str, list[Path]] = {}
     for path in sorted(predictions.rglob("*")):
         if path.suffix.lower() in ENDINGS:
             name = path.relative_to(predictions).with_suffix("").as_posix()
             files.setdefault(name, []).append(path)
+    wanted = data.wanted(set(files))
     faults: dict[str, list[str]] = {}
     for name in sorted(wanted | files.keys()):
         if name not in files:
@@ -147,8 +159,7 @@ def _found(predictions: Path, dataset: Path, samples: list[str]) -> dict[str, Pa
         elif len(files[name]) > 1:
             faults.setdefault("there twice", []).append(name)
         else:
-            (inspected,) = read_arrays(dataset, name, "inspected")
-            if fault := _fault(files[name][0], inspected):
+            if fault := _fault(files[name][0], data.picture(name).inspected):
                 faults.setdefault("invalid", []).append(f"{name} ({fault})")
     if faults:
         lines = [
@@ -203,50 +214,51 @@ def _judged(
     category: str,
     maps: dict[str, Path],
     options: argparse.Namespace,
-    index: dict[str, Any],
-    rate: float,
+    data: JudgedSet,
+    rate: float | None,
 ) -> tuple[SetUpLimit, dict[str, Any]]:
-    """Judge the maps of a category at a threshold from its good boards of ``validation``: limit
-    and scores."""
+    """Judge the maps of a category at a threshold from its good pictures that set it: limit and
+    scores."""
     import pandas as pd
 
     from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.study.limit import limit_of
-    from harness.programs.dataset.boards import read_arrays, read_truth
     from harness.runs.study_record import set_up_of
     from harness.trials.board import highest_within, pixel_areas
     from harness.trials.judge import matched_places, smeared
 
-    def boards(split: str) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray, float]]:
-        """Yield the boards of a split: name, scores (NaN if not inspected), places, damage,
+    def pictures(start: str) -> Iterator[tuple[str, np.ndarray, JudgedPicture, float]]:
+        """Yield the pictures whose name starts so: name, scores (NaN if not inspected), picture,
         inspected area."""
-        for sample in sorted(name for name in maps if name.startswith(f"{category}/{split}/")):
-            inspected, board_xy_m, damage = read_arrays(options.dataset, sample, *JUDGED_BY)
-            scores = np.where(inspected, _read(maps[sample]), np.nan)
-            places_m = board_xy_m.astype(float)
-            area_m2 = float(np.nansum(pixel_areas(places_m)[inspected]))
-            yield sample, scores, places_m, damage, area_m2
+        for sample in sorted(name for name in maps if name.startswith(f"{category}/{start}")):
+            picture = data.picture(sample)
+            scores = np.where(picture.inspected, _read(maps[sample]), np.nan)
+            area_m2 = float(np.nansum(pixel_areas(picture.places_m)[picture.inspected]))
+            yield sample, scores, picture, area_m2
 
-    if not any(name.startswith(f"{category}/validation/") for name in maps):
-        raise UserError(f"{options.dataset}: {category} has no board of validation")
-    quiet = [(np.nanmax(scores), area_m2) for _, scores, _, _, area_m2 in boards("validation")]
+    quiet_split = data.quiet_split(category, list(maps))
+    quiet = [
+        (np.nanmax(scores), area_m2) for _, scores, _, area_m2 in pictures(f"{quiet_split}/good/")
+    ]
     highest, areas_m2 = np.array(quiet, float).T
+    if rate is None:
+        rate = float(-np.log1p(-CALLING_SHARE) / areas_m2.mean())
     threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
-    radius_m = index["hit_radius_mm"] * MM
-    overlap = index["hit_overlap"]
+    radius_m = data.hit_radius_mm * MM
+    overlap = data.hit_overlap
     truths = []
     holes = list[dict[str, Any]]()
     runs = list[dict[str, Any]]()
     pixels = list[np.ndarray]()
     regions = list[np.ndarray]()
     tops = list[tuple[float, bool]]()
-    for name, scores, places_m, damage, area_m2 in boards("test"):
-        truth = read_truth(options.dataset, name)
-        damages = truth["damages"]
-        board = truth["board"]
+    for name, scores, picture, area_m2 in pictures("test/"):
+        places_m = picture.places_m
+        damage = picture.damage
+        board, damages = data.damages(name)
         truths.append([board, damages])
         lines = [np.array(flaw["line_m"]) for flaw in damages]
-        findings = _findings(places_m, scores > threshold)
+        findings = _findings(places_m, scores > threshold, picture.link_m)
         outlines = [np.flatnonzero(damage == flaw["id"]) for flaw in damages]
         areas = [] if overlap is None else smeared(outlines, damage.shape)
         ((pairs, parts),) = matched_places(
@@ -290,17 +302,17 @@ def _judged(
 
     if not holes:
         raise UserError(
-            f"{options.dataset}: {category} has no damage in view, so there is no limit to state"
+            f"{data.name}: {category} has no damage in view, so there is no limit to state"
         )
     record = set_up_of(
         pd.DataFrame(holes),
         pd.DataFrame(runs),
         variant=category,
-        frames=index["categories"][category]["frames"],
+        frames=data.categories[category]["frames"],
         detector=options.name,
         calibration_runs=len(highest),
         targets_digest=digest(truths),
-        frames_digest=digest([index["content"], category]),
+        frames_digest=digest([data.content, category]),
     )
     scores = np.concatenate(pixels)
     region = np.unique(np.concatenate(regions), return_inverse=True)[1]
@@ -315,16 +327,16 @@ def _judged(
     }
 
 
-def _findings(places_m: np.ndarray, above: np.ndarray) -> Findings:
-    """Return the findings of pixels ``above`` (h, w), without scores; their centres (m, 2) lie on
-    the face."""
+def _findings(places_m: np.ndarray, above: np.ndarray, link_m: float) -> Findings:
+    """Return the findings of pixels ``above`` (h, w), joined by steps of at most ``link_m``,
+    without scores; their centres (m, 2) lie on the face."""
     from detectors.findings.measure import centres_of
     from detectors.pixels.clusters import euclidean_clusters
     from detectors.score_map import Findings
 
     pixels = np.flatnonzero(above & np.isfinite(places_m[..., 0]))
     points = np.pad(places_m.reshape(-1, 2)[pixels], ((0, 0), (0, 1)))
-    labels = euclidean_clusters(points, LINK_M, 1)
+    labels = euclidean_clusters(points, link_m, 1)
     centres_m = centres_of(points, labels, int(labels.max(initial=-1)) + 1)[:, :2]
     return Findings(np.full(len(centres_m), np.nan), pixels, labels, centres_m)
 

@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from detectors import DETECTORS, detector_type, load_detector
+from detectors.filters import FILTERS, filter_settings_type, load_filter
 from harness.programs.keeping.written_files import is_output
 from harness.records.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE
 from harness.runs.journal import SEGMENT_NAME, Journal
@@ -55,13 +56,14 @@ def bytes_of(text: str) -> int:
 Row = Mapping[str, Any]
 SETTABLE = {
     "detectors": "settings",
+    "filters": "settings",
     "cameras": "numbers",
 }  # kinds of offers, and what can be set for each
 
 
 def plug_ins(kind: str) -> PlugIns:
-    """Return the detectors or the cameras."""
-    return DETECTORS if kind == "detectors" else CAMERAS
+    """Return the detectors, the filters or the cameras."""
+    return {"detectors": DETECTORS, "filters": FILTERS, "cameras": CAMERAS}[kind]
 
 
 def offered(kind: str) -> list[Row]:
@@ -85,14 +87,14 @@ def offered(kind: str) -> list[Row]:
 def shown(kind: str, name: str) -> Row:
     """Return an offer's row with all of its settings. Raises UserError if it is unknown, ambiguous
     or broken."""
-    settable = _detector_settings(name) if kind == "detectors" else _numbers(name)
+    settable = _numbers(name) if kind == "cameras" else _declared_settings(kind, name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
 
 def grid_of(kind: str, rows: Sequence[Row]) -> Grid:
     """Return a table of rows of offers."""
     heads: tuple[str, ...] = ("pixels", "range", "light", "title")
-    if kind == "detectors":
+    if kind != "cameras":
         heads = ("version", "what it does")
     lines = []
     for row in rows:
@@ -128,6 +130,8 @@ def _facts(kind: str, name: str) -> Row:
             "version": version,
             "about": (inspect.getdoc(loaded) or "").strip().partition("\n")[0],
         }
+    if kind == "filters":
+        return _facts_of_filter(name)
     camera = load_camera(name)
     optics = camera.optics
     return {
@@ -140,15 +144,27 @@ def _facts(kind: str, name: str) -> Row:
     }
 
 
-def _detector_settings(name: str) -> list[dict[str, Any]]:
-    """Return every setting with default and legal values; of several kinds, only the settings of
-    the default kind."""
-    settings_type = detector_type(name).settings_type
+def _facts_of_filter(name: str) -> Row:
+    """Return the facts of a filter. Raises UserError if it cannot be used."""
+    filter_settings_type(name)
+    about = inspect.getdoc(FILTERS.load(FILTERS.offer(name))) or ""
+    version = None
+    with contextlib.suppress(UserError):  # not known without settings
+        version = load_filter(name, {}).version
+    return {"version": version, "about": about.strip().partition("\n")[0]}
+
+
+def _declared_settings(kind: str, name: str) -> list[dict[str, Any]]:
+    """Return every setting of a detector or filter with default and legal values; of several
+    kinds, only the settings of the default kind."""
+    settings_type = _settings_type(kind, name)
     try:
         defaults = settings_type().to_data()
     except ValidationError as error:
         lacking = ", ".join(".".join(map(str, error["loc"])) for error in error.errors())
-        raise UserError(f"detector {name!r} has settings without a default: {lacking}") from error
+        raise UserError(
+            f"{plug_ins(kind).noun} {name!r} has settings without a default: {lacking}"
+        ) from error
     declared = Declared(settings_type, defaults, {})
 
     def legal(path: tuple[str, ...]) -> str:
@@ -161,6 +177,11 @@ def _detector_settings(name: str) -> list[dict[str, Any]]:
         {"path": ".".join(path), "value": value, "about": legal(path)}
         for path, value in leaves(defaults)
     ]
+
+
+def _settings_type(kind: str, name: str) -> Any:
+    """Return the declaration of a detector's or filter's settings."""
+    return filter_settings_type(name) if kind == "filters" else detector_type(name).settings_type
 
 
 def _numbers(name: str) -> list[dict[str, Any]]:
@@ -185,16 +206,16 @@ def leaves(
 
 
 def reference() -> str:
-    """Return every key of an experiment and of tofpod's detectors in Markdown: legal values,
-    default, meaning."""
+    """Return every key of an experiment and of tofpod's detectors and filters in Markdown: legal
+    values, default, meaning."""
     from harness.experiment.schema import ExperimentConfig
 
     sections = {"Experiments": every_key(ExperimentConfig)}
-    for offer in plug_ins("detectors").offers():
-        if offer.built_in:
-            sections[f"Settings of the detector `{offer.name}`"] = every_key(
-                detector_type(offer.name).settings_type
-            )
+    for kind in ("detectors", "filters"):
+        for offer in plug_ins(kind).offers():
+            if offer.built_in:
+                title = f"Settings of the {plug_ins(kind).noun} `{offer.name}`"
+                sections[title] = every_key(_settings_type(kind, offer.name))
     lines = [
         "# Every key",
         "",

@@ -21,8 +21,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "what",
         nargs="?",
-        help="detectors, cameras, results, cache, artefacts, keys (of experiments); "
-        "or a detector or camera",
+        help="detectors, filters, cameras, results, cache, artefacts, keys (of experiments); "
+        "or a detector, filter or camera",
     )
     add(
         "name",
@@ -41,10 +41,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "List detectors and cameras: tofpod's own and those that installed packages offer "
+    "List detectors, filters and cameras: tofpod's own and those that installed packages offer "
     "through the entry point "
-    "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of "
-    "renders, the age of stored answers (artefacts), or all keys of an experiment.",
+    "groups tofpod.detectors, tofpod.filters and tofpod.cameras. Or list results folders, the "
+    "cache of renders, the age of stored answers (artefacts), or all keys of an experiment.",
     "tofpod ls cameras kinect_v2",
     "tofpod ls thesis",
 )
@@ -104,7 +104,7 @@ def _list_offers(options: argparse.Namespace) -> int:
         ]
         heads = (
             ("setting", "default", "legal")
-            if kind == "detectors"
+            if kind != "cameras"
             else ("number", "value", "tag and source")
         )
         show([grid_of(kind, [row]), "", Grid.of(heads, settable, left=3)])

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 
 from harness.programs.coverage.tables import COVERAGE_TABLES
 from harness.programs.efficiency.tables import EFFICIENCY_TABLES
+from harness.programs.filters.tables import FILTER_COSTS
 from harness.records.outputs import FILES, JOURNAL, LATEST
 from harness.records.schema import Table
 from harness.records.trials import (
@@ -46,6 +47,7 @@ GROUPS = {
     "(in `point-000/`, ..., except `summary.csv`)",
     "check": "Also written by `tofpod check`",
     "efficiency": "Also written by `tofpod efficiency`",
+    "filters": "Also written by `tofpod filters`",
     "coverage": "Written by `tofpod coverage`",
 }
 
@@ -63,6 +65,7 @@ def results_readme() -> Iterator[str]:
     yield from _tables("Summaries of an experiment that is not a study", SUMMARISED)
     yield from _tables("Detection limits of a study", STUDY_TABLES)
     yield from _tables("Efficiency of a study's detectors", EFFICIENCY_TABLES)
+    yield from _tables("What filters cost (`tofpod filters`)", (FILTER_COSTS,))
     yield from _tables("Coverage of a part (`tofpod coverage`)", COVERAGE_TABLES)
     yield from _tables("Trials of a study", STUDY_ONLY)
     yield from _tables("Anomaly maps on a data set (`tofpod score`)", (SCORES,))

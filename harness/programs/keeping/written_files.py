@@ -6,6 +6,7 @@ from fnmatch import fnmatchcase
 from harness.programs.atlas.tables import ATLAS
 from harness.programs.coverage.tables import COVERAGE_TABLES
 from harness.programs.efficiency.tables import EFFICIENCY_TABLES
+from harness.programs.filters.tables import FILTER_COSTS
 from harness.records.outputs import FILES, FolderKind, Output
 from harness.records.trials import STORED, STUDY_ONLY, SUMMARISED
 from harness.tables.study import STUDY_TABLES
@@ -19,6 +20,7 @@ def outputs() -> Iterator[Output]:
         (SUMMARISED, "other"),
         (STUDY_TABLES, "study"),
         (EFFICIENCY_TABLES, "efficiency"),
+        ((FILTER_COSTS,), "filters"),
         ((ATLAS,), "atlas"),
         (COVERAGE_TABLES, "coverage"),
     ):

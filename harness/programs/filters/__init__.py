@@ -1,0 +1,1 @@
+"""``tofpod filters``: what a filter from depth to depth costs."""
