@@ -123,6 +123,15 @@ def _one_unit(limit: SetUpLimit) -> Estimate:
     )
 
 
+def _by_signals(limit: SetUpLimit) -> str:
+    """Return a90 from signals with its interval, or why it is not stated."""
+    signals = limit.from_signals
+    if signals.why:
+        return f"not stated: {signals.why}"
+    ends = signals.a90_interval_mm
+    return Estimate(signals.a90_mm, ends.low, ends.high, limit.largest_mm).text()
+
+
 def _verdict(limit: SetUpLimit, bound: Bound) -> str:
     if is_within_sizes(limit, bound):
         return "demonstrated"
@@ -224,6 +233,26 @@ LIMITS = Table(
         Column(
             "a50_mm", "a50 (mm)", a50_of, f"{FOUND_50}, with its 95 % interval over boards", **BRIEF
         ),
+        Column("", "a90 by signals (mm)", _by_signals, brief=False),
+        Column(
+            "a90_signal_mm",
+            "",
+            ("from_signals.a90_mm", "from_signals.a90_interval_mm"),
+            f"{FOUND_90} by the damages' signals, with its 95 % interval; empty if not stated",
+        ),
+        Column(
+            "a50_signal_mm",
+            "",
+            ("from_signals.a50_mm", "from_signals.a50_interval_mm"),
+            f"{FOUND_50} likewise",
+        ),
+        Column(
+            "a90_95_signal_mm",
+            "",
+            "from_signals.a90_95_mm",
+            "upper bound of a90_signal_mm at 95 % confidence",
+        ),
+        Column("signal_why", "", "from_signals.why", "reason why these are not stated, if any"),
         Column("limit_of", "", "record.inspected.limit_of", SIZES_OF),
         Column(
             "is_at_most",

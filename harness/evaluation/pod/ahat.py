@@ -90,12 +90,15 @@ def fit_ahat(
     log_size: bool = False,
     log_signal: bool = False,
     inspections: ArrayLike | None = None,
+    found: ArrayLike | None = None,
 ) -> AhatFit:
     """Regress ``signal`` (n,) on ``size`` (n,) with censoring, and derive the POD of signals above
     ``decision``.
 
     Signals <= ``left`` are at the noise floor, signals >= ``right`` are saturated. ``inspections``
-    (n,): the target of each row. Raises UserError for data that allow no such regression, or a
+    (n,): the target of each row. ``found`` (n,) bool: what was found, where ``left`` is the
+    ``decision``; whatever its signal, a miss lies below it, and a find is only known to lie above
+    it if its signal does not. Raises UserError for data that allow no such regression, or a
     signal that does not grow with size."""
     sizes = _finite("sizes", size)
     signals = _finite("signals", signal)
@@ -110,6 +113,10 @@ def fit_ahat(
     _check_limits(low, decision, high)
     below = signals <= low
     above = signals >= high
+    if found is not None:
+        above = np.asarray(found, bool) & (below | above)
+        below = ~np.asarray(found, bool)
+        signals = np.where(below, low, signals)
     _check_that_signals_vary(signals[~(below | above)])
     x = _axis("sizes", sizes, log_size)
     y = _axis("signals", np.clip(signals, low, high), log_signal)

@@ -28,7 +28,7 @@ from harness.evaluation.pod.averaged import (
     log_weights,
     weighted_quantile,
 )
-from harness.evaluation.pod.curve import Bound, link_cdf, link_ppf, logs_of_link
+from harness.evaluation.pod.curve import Bound, link_cdf, link_ppf, log_likelihoods
 from harness.evaluation.pod.hit_miss import HitMissFit
 
 METHOD = "average over models and clusters"
@@ -154,9 +154,9 @@ def _curves_of(average: ModelAverage, number: int, cluster: np.ndarray, effect: 
     farthest_shift = REACH * DEVIATIONS[link] * widths[-1] / (high - low)
     beyond = int(min(np.ceil(farthest_shift / spacing), FARTHEST))
     line = middles[0] + spacing * np.arange(-beyond, MIDDLES + beyond)
-    log_likelihoods = _of_clusters(fit, cluster, line, widths_on_clusters) / effect
-    highest = log_likelihoods.max(axis=1, keepdims=True)
-    likelihoods = np.exp(log_likelihoods - highest)
+    of_clusters = _of_clusters(fit, cluster, line, widths_on_clusters) / effect
+    highest = of_clusters.max(axis=2, keepdims=True)
+    likelihoods = np.exp(of_clusters - highest)
     range_z = float(np.ptp(fit.data.z))
     log_even = log_weights(widths / range_z, max(fit.targets, 3))
     log_cell = np.log(spacing * np.log(RATIO) / range_z)
@@ -164,15 +164,15 @@ def _curves_of(average: ModelAverage, number: int, cluster: np.ndarray, effect: 
     sigma = []
     steps = []
     logs = []
-    shares = _share_weights() if len(likelihoods) > 1 else np.ones(1)
+    shares = _share_weights() if likelihoods.shape[1] > 1 else np.ones(1)
     for step, share in enumerate(shares):
         for place, width in enumerate(widths):
             on_clusters = place + STEPS - 1 - step
             width_of_f = width / (high - low)
             deviation = DEVIATIONS[link] * np.sqrt(SHARES[step]) * width_of_f
-            mean = _over_shifts(likelihoods[:, :, on_clusters], line, beyond, deviation)
+            mean = _over_shifts(likelihoods[on_clusters], line, beyond, deviation)
             with np.errstate(divide="ignore"):
-                log_likelihood = np.log(mean).sum(axis=0) + highest[:, 0, on_clusters].sum()
+                log_likelihood = np.log(mean).sum(axis=0) + highest[on_clusters].sum()
             logs.append(log_likelihood + log_even[place] + np.log(share) + log_cell)
             mu.append(middles - half * width_of_f * RATIO**-step)
             sigma.append(np.full(MIDDLES, width_of_f))
@@ -222,7 +222,7 @@ def _stretched(values: np.ndarray, factor: float) -> tuple[float, float]:
 def _of_clusters(
     fit: HitMissFit, cluster: np.ndarray, middles: np.ndarray, widths: np.ndarray
 ) -> np.ndarray:
-    """Return the log-likelihoods (clusters, middles, widths) of curves on each cluster, per
+    """Return the log-likelihoods (widths, clusters, middles) of curves on each cluster, per
     target."""
     low, half, high = link_ppf(fit.curve.link, np.array([0.1, 0.5, 0.9]))
     z = fit.data.z
@@ -230,12 +230,11 @@ def _of_clusters(
     hits = np.bincount(row, fit.data.hits) / fit.repeats
     misses = np.bincount(row, fit.data.misses) / fit.repeats
     _, starts = np.unique(rows[:, 0], return_index=True)
-    values = np.empty((len(starts), len(middles), len(widths)))
+    values = np.empty((len(widths), len(starts), len(middles)))
     for place, width in enumerate(widths):
         predictor = half + (high - low) * (rows[:, 1:] - middles) / width
-        log_hit, log_miss, _ = logs_of_link(fit.curve.link, predictor)
-        of_rows = hits[:, None] * log_hit + misses[:, None] * log_miss
-        values[:, :, place] = np.add.reduceat(of_rows, starts)
+        of_rows = log_likelihoods(fit.curve.link, predictor, hits, misses)
+        values[place] = np.add.reduceat(of_rows, starts)
     return values
 
 

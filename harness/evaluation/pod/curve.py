@@ -32,6 +32,13 @@ _INVERSE: dict[str, Function] = {
     "cloglog": lambda p: np.log(-np.log1p(-p)),
     "loglog": lambda p: -np.log(-np.log(p)),
 }
+_LOG_CDF: dict[str, Function] = {
+    "logit": lambda t: np.minimum(t, 0.0) - np.log1p(np.exp(-np.abs(t))),
+    "probit": special.log_ndtr,
+    "cloglog": lambda t: np.log(-np.expm1(-np.exp(t))),
+    "loglog": lambda t: -np.exp(-t),
+}
+_MIRRORED = {"logit": "logit", "probit": "probit", "cloglog": "loglog", "loglog": "cloglog"}
 LINKS = tuple(_CDF)
 # curves times targets, or resampled boards times their targets, in one block: 1 MB per array
 CELLS = 2**17
@@ -73,6 +80,22 @@ def logs_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if link == "cloglog":
         return log_any, log_none, log_density
     return log_none, log_any, log_density
+
+
+def log_likelihoods(
+    link: str, predictor: np.ndarray, hits: np.ndarray, misses: np.ndarray
+) -> np.ndarray:
+    """Return hits ln F + misses ln(1 - F) (n, m) from the predictors (n, m) of n rows on m curves
+    and the counts (n,). Most rows were only hit or only missed, so this takes half the logarithms
+    of `logs_of_link`."""
+    t = _limited(predictor)
+    values = np.zeros_like(t)
+    found = hits > 0
+    values[found] = hits[found, None] * _LOG_CDF[link](t[found])
+    missed = misses > 0
+    # 1 - F(t) is the mirrored link at -t
+    values[missed] += misses[missed, None] * _LOG_CDF[_MIRRORED[link]](-t[missed])
+    return values
 
 
 def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -175,6 +198,9 @@ class HitsAndMisses:
     def value(self, b: np.ndarray) -> np.ndarray:
         """Return the (penalised) log-likelihood (...) at coefficients (..., p); for several
         studies (d,) at (d, p)."""
+        if self.penalty is None and self.hits.ndim == 1 and b.ndim == 2:
+            by_row = self.design @ b.T + self.offset
+            return log_likelihoods(self.link, by_row, self.hits, self.misses).sum(axis=0)
         predictor = b @ self.design.T + self.offset
         log_hit, log_miss, log_density = logs_of_link(self.link, predictor)
         value = (self.hits * log_hit + self.misses * log_miss).sum(axis=-1)

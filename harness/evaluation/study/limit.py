@@ -38,6 +38,7 @@ from harness.evaluation.study.boards import (
     weights_in_blocks,
 )
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.evaluation.study.signals import SignalSizes, sizes_from_signals
 from harness.evaluation.study.surface import depth_varies
 from harness.evaluation.study.units import OverUnits, over_units
 from harness.vocabulary.errors import UserError
@@ -99,6 +100,8 @@ class SetUpLimit:
     """Limits over several units of the camera; None for a single unit."""
     beside: FalseCallRate | None
     """Findings on damaged boards that match no damage."""
+    from_signals: SignalSizes
+    """a50 and a90 from the damages' signals, to stand beside those from hits and misses."""
     size_error_mm: float = np.nan
     """Median error of the size of the hits that a model measured."""
     sized: int = 0
@@ -156,6 +159,7 @@ def limit_of(
         sizes = _sizes_if_all_found(targets, draws)
     else:
         sizes = _no_sizes(why, draws)
+    hits = None if statement is None else statement.fits[0]
     false_calls, false_calls_interval = _false_calls(record.unflawed, draws, "hole-free")
     beside, _ = _false_calls(record.beside, draws, "damaged")
     return SetUpLimit(
@@ -180,6 +184,7 @@ def limit_of(
         largest_mm=float(inspected.size_mm.max()) if len(inspected.hit) else np.nan,
         over_units=sizes.over_units,
         beside=beside,
+        from_signals=sizes_from_signals(record, hits),
     )
 
 

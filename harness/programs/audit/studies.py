@@ -124,6 +124,11 @@ def claims_of(case: StudyCase, threshold: RateThreshold, limit: SetUpLimit) -> l
     if limit.statement is not None:
         claims.append(_interval_claim("a50", limit.a50_interval_mm, a50_mm))
         claims.append(_interval_claim("a90", limit.a90_interval_mm, a90_mm))
+    signals = limit.from_signals
+    if signals.lines:
+        claims.append(_interval_claim("a50 by signals", signals.a50_interval_mm, a50_mm))
+        claims.append(_interval_claim("a90 by signals", signals.a90_interval_mm, a90_mm))
+        claims.append(_bound_claim("a90/95 by signals", signals.a90_95_mm, a90_mm))
     if limit.false_calls is not None:
         counted = limit.false_calls.interval_per_m2
         claims.append(_interval_claim("counted rate", counted, case.rate_at(threshold.value)))

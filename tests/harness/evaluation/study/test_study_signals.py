@@ -1,0 +1,156 @@
+"""a50 and a90 from signals: known truth, assumptions that do not hold, and the parts of the
+variance."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import special
+
+from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.study.record import SetUpRecord, ThresholdError
+from harness.evaluation.study.signals import SATURATED, SignalSizes, sandwich, sizes_from_signals
+from harness.programs.audit.studies import StudyCase, drawn_threshold, recorded
+from harness.vocabulary.seeds import random_stream
+
+A50_MM = 6.0
+SCATTER_MM = 1.2
+CASE = StudyCase("signals", 1.0, boards=30)
+NORMAL_90 = float(special.ndtri(0.9))
+
+
+def studied(
+    number: int, *, boards_mm: float = 0.0, plateau_mm: float = np.inf, shrinks: float = 0.0
+) -> SetUpRecord:
+    """Return a set-up whose signals grow in a straight line with normal scatter, and lie above
+    noise; or to a plateau, or with scatter that ``shrinks`` with size."""
+    random = random_stream(0, "test of signals", number)
+    threshold = drawn_threshold(CASE, random)
+    count = CASE.boards * CASE.holes
+    size_mm = random.permutation(np.linspace(1.0, 14.0, count))
+    shift_mm = np.repeat(boards_mm * random.standard_normal(CASE.boards), CASE.holes)
+    scatter_mm = SCATTER_MM * np.exp(-shrinks * (size_mm - A50_MM)) * random.standard_normal(count)
+    above_mm = np.minimum(size_mm - A50_MM, plateau_mm) - shift_mm + scatter_mm
+    record = recorded(CASE, threshold, size_mm=size_mm, above_mm=above_mm, calls=np.zeros(60, int))
+    floor = 2.6 + 0.2 * random.gumbel(size=count)
+    return with_signal(record, np.maximum(record.inspected.signal, floor))
+
+
+def with_signal(record: SetUpRecord, signal: np.ndarray) -> SetUpRecord:
+    return dataclasses.replace(
+        record, inspected=dataclasses.replace(record.inspected, signal=signal)
+    )
+
+
+def sizes(record: SetUpRecord) -> SignalSizes:
+    inspected = record.inspected
+    return sizes_from_signals(
+        record, fit_hit_miss(inspected.size_mm, inspected.hit, link="probit", log_size=False)
+    )
+
+
+def test_it_covers_the_truth_and_scatters_less_than_hits():
+    """In 60 studies each of boards that differ by 0 to 1 mm, 95 to 97 % cover."""
+    a90_mm = A50_MM + NORMAL_90 * float(np.hypot(SCATTER_MM, 0.5))
+    covers = []
+    by_signals = []
+    by_hits = []
+    for number in range(24):
+        record = studied(number, boards_mm=0.5)
+        stated = sizes(record)
+        if stated.why:
+            continue
+        interval = stated.a90_interval_mm
+        covers.append(interval.low <= a90_mm <= interval.high)
+        by_signals.append(stated.a90_mm - a90_mm)
+        fit = fit_hit_miss(record.inspected.size_mm, record.inspected.hit, link="probit")
+        by_hits.append(fit.curve.size_at(0.9) - a90_mm)
+    assert len(covers) >= 21
+    assert np.mean(covers) >= 0.86
+    assert abs(np.mean(by_signals)) < 0.12
+    assert np.var(by_signals) < 0.7 * np.var(by_hits)
+
+
+def test_what_is_missed_says_nothing_but_that():
+    record = studied(0)
+    hit = record.inspected.hit
+    other = with_signal(record, np.where(hit, record.inspected.signal, 0.1))
+    assert sizes(other).a50_mm == sizes(record).a50_mm
+
+
+def test_what_is_found_by_missing_returns_lies_above_the_threshold():
+    record = studied(1)
+    inspected = record.inspected
+    saturated = inspected.signal > SATURATED * record.threshold
+    without = with_signal(record, np.where(saturated, np.nan, inspected.signal))
+    assert abs(sizes(without).a50_mm - sizes(record).a50_mm) < 0.05
+
+
+def test_boards_that_differ_widen_the_interval_as_a_jackknife_does():
+    record = studied(2, boards_mm=1.5)
+    (line, *_) = sizes(record).lines
+    assert not line.fit.log_size
+    board = record.inspected.board
+    sizes_mm = []
+    for name in np.unique(board):
+        kept = board != name
+        columns = {
+            key: column[kept]
+            for key, column in vars(record.inspected).items()
+            if isinstance(column, np.ndarray)
+        }
+        without = dataclasses.replace(record.inspected, **columns)
+        lines = sizes(dataclasses.replace(record, inspected=without)).lines
+        axes = {(other.fit.log_size, other.fit.log_signal): other for other in lines}
+        same = axes[(line.fit.log_size, line.fit.log_signal)]
+        sizes_mm.append(same.fit.curve.size_at(0.9))
+    jackknife = (CASE.boards - 1) * np.var(sizes_mm)
+    assert sandwich(line.influence_at(0.9)) == pytest.approx(jackknife, rel=0.2)
+    of_damages = line.fit.curve.covariance
+    assert sandwich(line.influence_at(0.5)) > 1.3 * of_damages[0, 0]
+
+
+def test_the_thresholds_error_is_error_over_slope():
+    record = studied(3)
+    exact = dataclasses.replace(record, threshold_error=None)
+    error = ThresholdError(error=0.4, low_per_m2=0.5, high_per_m2=2.0, method="test")
+    loose = dataclasses.replace(record, threshold_error=error)
+    (line, *_) = sizes(exact).lines
+    (same, *_) = sizes(loose).lines
+    assert not line.fit.log_signal
+    added = same.variance(0.9) - line.variance(0.9)
+    assert added == pytest.approx((0.4 / line.fit.b1) ** 2)
+    # the signal grows by 0.8 with each mm
+    assert np.sqrt(added) == pytest.approx(0.5, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"plateau_mm": 3.0}, "straight line"), ({"shrinks": 0.2}, "signals")],
+)
+def test_an_assumption_that_does_not_hold_is_named(changes, words):
+    stated = sizes(studied(4, **changes))
+    assert words in stated.why
+    assert not stated.lines
+    assert np.isnan(stated.a90_mm)
+    assert np.isnan(stated.a90_95_mm)
+    assert not stated.a90_interval_mm.known
+
+
+def test_hits_that_signals_do_not_decide_contradict_them():
+    record = studied(5)
+    inspected = record.inspected
+    missed = inspected.size_mm < 9.0
+    hit = inspected.hit & ~missed
+    record = dataclasses.replace(record, inspected=dataclasses.replace(inspected, hit=hit))
+    assert sizes(record).why
+
+
+def test_without_data_it_says_so():
+    record = studied(6)
+    assert "no curve" in sizes_from_signals(record, None).why
+    assert "several units" in sizes(dataclasses.replace(record, units=2)).why
+    high = with_signal(record, np.where(record.inspected.hit, 1e3, 0.0))
+    assert "0 signals lie between" in sizes(high).why
