@@ -47,7 +47,7 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=setting)
     reference = (
         "what the part should look like: an earlier capture of it or its folder of --out, a folder "
-        "of captures of good parts, or a mesh (--set surface.reference.unit=m, .front=-y)"
+        "of captures of good parts, or a mesh (--set reference.unit=m, .front=-y)"
     )
     add("--reference", type=Path, metavar="WHAT", help=reference)
     averages = ("mean", "median", "clipped")

@@ -33,8 +33,8 @@ from detectors.methods.network import read_network
 from harness.__main__ import MODULES, PROGRAMS, main
 from harness.experiment.load import load_experiment
 from harness.vocabulary.geometry import MM, Cloud, Lens
-from tests.detectors.surfaces.test_reference import casting
-from tests.detectors.surfaces.test_reference import seen as casting_seen
+from tests.detectors.surfaces.test_drawing import casting
+from tests.detectors.surfaces.test_drawing import seen as casting_seen
 from tests.detectors.views.marks.test_marks_coded import PLACES, tags
 from tests.support import marked_board, tiny_dataset
 from tests.support.marked_boards import LENS, board_pose, marked_cloud, strips

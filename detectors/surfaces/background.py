@@ -22,7 +22,6 @@ from detectors.pixels.medians import group_medians
 from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
-from detectors.surfaces.reference import laid_on
 from detectors.surfaces.surface import (
     BISQUARE_TUNING,
     Fit,
@@ -61,7 +60,7 @@ MISFIT_FROM = 0.1
 """Share of the area with structure from which a warning of a misfit is given."""
 MISFIT_AT_RIM_FROM = 0.05
 """The same for what lies off the surface at the rim, where other surfaces come into view."""
-STATED = ("polynomial", "mesh", "expected")  # shapes that the user states
+STATED = ("polynomial", "expected")  # shapes that the user states
 STRUCTURE_CELLS = 5  # side of the block averaged to see structure
 STRUCTURE_SIGMAS = 4.0  # least significance of structure
 SEEN = 0.5
@@ -173,7 +172,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         return _of_few_points(cloud, points, mask, config)
     wavelength = None
     profile = None
-    reference = _reference(cloud, points, config)
+    reference = _reference(cloud, config)
     if reference is not None:
         name = reference.text
         fit = reference.z_at
@@ -213,7 +212,7 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     spread_m = np.zeros(len(points))
     if profile is not None:
         spread_m = profile.spread_at(points)
-    elif reference is not None and config.shape == "expected":
+    elif reference is not None:
         spread_m = _spread_of(reference, points, unseen)
     return Background(
         surface_z_m=on_grid(fitted, mask),
@@ -231,7 +230,7 @@ def _of_few_points(
     cloud: Cloud, points: np.ndarray, mask: np.ndarray, config: SurfaceConfig
 ) -> Background:
     """Return the stated surface, or a plane, behind points (n, 3) that are too few to judge it."""
-    reference = _reference(cloud, points, config)
+    reference = _reference(cloud, config)
     if reference is not None:
         name = reference.text
         fit = reference.z_at
@@ -254,11 +253,9 @@ def _of_few_points(
     )
 
 
-def _reference(cloud: Cloud, points: np.ndarray, config: SurfaceConfig) -> ExpectedSurface | None:
-    """Return the surface that a reference says points (n, 3) of the cloud should show; None if the
-    surface is fitted to them. Raises UserError if the cloud has none."""
-    if config.reference is not None:
-        return laid_on(points, config.reference, cloud.projection == "central")
+def _reference(cloud: Cloud, config: SurfaceConfig) -> ExpectedSurface | None:
+    """Return the surface that a reference says the cloud should show; None if the surface is fitted
+    to it. Raises UserError if the cloud has none."""
     if config.shape != "expected":
         return None
     if cloud.expected is None:

@@ -2,7 +2,7 @@
 placed on the cloud and met by its rays.
 
 An earlier capture, good parts and a drawing differ in how their triangles come about
-(`detectors.surfaces.scans`, `detectors.surfaces.reference`), not in what a detector receives.
+(`detectors.surfaces.scans`, `detectors.surfaces.drawing`), not in what a detector receives.
 
 Closest points, then closest planes, move the cloud onto the triangles (Besl and McKay 1992; Chen
 and Medioni 1992); points off them count less (Tukey). Where marks state the pose, the planes

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import numba
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.linalg import eigh
 from scipy.linalg.lapack import dpotrf, dpotrs
 
@@ -23,7 +23,6 @@ from detectors.pixels.noise import median_of
 from detectors.surfaces.interior_point import least_absolute
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.meshes import FILES, FileUnit, FrontAxis
 
 SAMPLE_POINTS = 2048
 BISQUARE_TUNING = 4.685  # 95 % efficiency for Gaussian noise; MATLAB's default
@@ -49,24 +48,13 @@ TINY_M = 1e-9  # residuals below a nanometre are rounding errors
 Solution = tuple[np.ndarray, str]  # coefficients (p,) and a description of the fit
 
 
-class ReferenceConfig(Config):
-    """The part's own mesh, which may be open."""
-
-    file: Annotated[str, Field(min_length=1, max_length=1000, description=FILES)]
-    unit: FileUnit = "mm"
-    # the axis of the file that points to the camera
-    front: FrontAxis = "+z"
-
-
 class SurfaceConfig(Config):
     """The kind of surface that is fitted, and how."""
 
     # ``polynomial``, of the stated degree; ``auto``, the simplest of plane, polynomials, quadric
-    # and free form that the cloud supports; ``free_form``; ``mesh``, the reference's;
-    # ``expected``, what the cloud's own reference says
-    shape: Literal["polynomial", "auto", "free_form", "mesh", "expected"] = "polynomial"
-    # the mesh that is fitted to the cloud
-    reference: ReferenceConfig | None = None
+    # and free form that the cloud supports; ``free_form``; ``expected``, what the cloud's
+    # reference says
+    shape: Literal["polynomial", "auto", "free_form", "expected"] = "polynomial"
     # width above which a free form follows the cloud
     scale_mm: float | None = Field(default=None, gt=0)
     # total degree of the polynomial (3: MATLAB's poly33)
@@ -77,12 +65,6 @@ class SurfaceConfig(Config):
     method: Literal["lar", "bisquare", "lts", "least_squares"] = "lar"
     # whether terms in both x and y are left out (as in the thesis' script)
     drop_cross_terms: bool = False
-
-    @model_validator(mode="after")
-    def _one_surface(self) -> Self:
-        if (self.shape == "mesh") != (self.reference is not None):
-            raise ValueError("shape: mesh and reference: {file: part.stl} need each other")
-        return self
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from detectors.interface import Detector
     from detectors.recordings import Recording
+    from detectors.surfaces.drawing import DrawingFile
     from detectors.views.mapping.settings import MappingConfig
     from detectors.views.marks.mark import MarksConfig
     from harness.vocabulary.geometry import Lens
@@ -37,8 +38,11 @@ DEFAULT_DETECTOR = "auto"
 """The detector is chosen on the capture among `CANDIDATES`."""
 CANDIDATES = ("matched", "local", "thesis")
 """Detectors among which a capture chooses; the first is used where it cannot."""
-# prefix of the --set keys for merging views; all other keys are the detector's
+# prefixes of the --set keys for merging views and for the drawing; all other keys are the
+# detector's
 PREFIX = "mapping."
+DRAWING_PREFIX = "reference."
+PREFIXES = (PREFIX, DRAWING_PREFIX)
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
 LEGAL_CROP = (
@@ -103,6 +107,12 @@ def refuse_misfits(arguments: argparse.Namespace, paths: list[Path]) -> None:
             "--quiet-capture and --reference: the threshold is that of a part that is compared with"
             " the reference",
             fix="leave out --quiet-capture; or record it among the good parts of --reference",
+        )
+    drawing = [text for text in arguments.set if text.startswith(DRAWING_PREFIX)]
+    if drawing and (reference is None or not is_mesh(reference)):
+        raise UserError(
+            f"--set {drawing[0]}: concerns a mesh, and none is the reference",
+            fix="name it with --reference part.stl",
         )
     if arguments.register is None:
         names = ["merge", "poses"] if is_compared else ["merge", "marks", "poses"]
@@ -218,8 +228,6 @@ def detector_of(
         if "surface" not in settings_type.model_fields:
             raise UserError(f"--reference {reference}: detector {name} has no surface setting")
         settings["surface"] = {"shape": "expected"}
-        if is_mesh(reference):
-            settings["surface"] = {"shape": "mesh", "reference": {"file": str(reference)}}
     elif "surface" in settings_type.model_fields and not any(
         assignment.startswith(STATED_SURFACE) for assignment in assignments
     ):
@@ -243,6 +251,18 @@ def is_mesh(path: Path) -> bool:
         return False
     faces = re.search(rb"element face (\d+)", head)
     return faces is not None and int(faces[1]) > 0
+
+
+def drawing_file_of(arguments: argparse.Namespace) -> DrawingFile:
+    """Return the mesh of --reference with its unit and front. Raises UserError."""
+    from detectors.surfaces.drawing import DrawingFile
+    from harness.vocabulary.declaration.diagnose import settings_of
+
+    data: dict[str, Any] = {"file": str(arguments.reference)}
+    for assignment in arguments.set:
+        if assignment.startswith(DRAWING_PREFIX):
+            assign(data, assignment.removeprefix(DRAWING_PREFIX))
+    return settings_of(DrawingFile, data, "settings of the drawing", DRAWING_PREFIX.rstrip("."))
 
 
 def rate_text(arguments: argparse.Namespace) -> str:

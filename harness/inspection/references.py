@@ -1,9 +1,8 @@
-"""The reference of an inspection: an earlier capture of the part, or captures of good parts. A mesh
-is a setting of the detectors (`detectors.surfaces.reference`)."""
+"""The reference of an inspection: an earlier capture of the part, captures of good parts, or a
+drawing."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from detectors.crop import AnyCrop, crop
 from detectors.interface import Detector, Evidence
+from detectors.surfaces.drawing import Drawing, DrawingFile, drawing_under, read_drawing
 from detectors.surfaces.expected import KnownPose
 from detectors.surfaces.scans import GoodParts, PartScan, good_parts, laid_under, scan_of
 from detectors.views.marks.find import find_marks
@@ -100,7 +100,34 @@ def pose_by_marks(reference: SeenPart, part: SeenPart) -> KnownPose | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class DrawnReference:
+    """The drawing that a part is compared with."""
+
+    path: Path
+    """As stated."""
+    drawing: Drawing
+
+    @property
+    def name(self) -> str:
+        """Return what it is, in words."""
+        return f"the drawing {self.path.name}"
+
+    @property
+    def files(self) -> list[Path]:
+        """Return the files that were read."""
+        return [self.path]
+
+    def under(self, part: SeenPart) -> Cloud:
+        """Return the cloud of a part with what is expected of it. Raises UserError if the drawing
+        is not of this part."""
+        cloud = part.cloud
+        points_m = cloud.points_m[part.mask]
+        central = cloud.projection == "central"
+        return replace(cloud, expected=drawing_under(self.drawing, points_m, central))
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedReference:
     """The captures that a part is compared with."""
 
     path: Path
@@ -113,6 +140,16 @@ class Reference:
     """The surface that is expected."""
     stack: GoodParts | None
     """The good parts; None for an earlier capture."""
+
+    @property
+    def name(self) -> str:
+        """Return what it is, in words."""
+        return self.scan.name
+
+    @property
+    def files(self) -> list[Path]:
+        """Return the files that were read."""
+        return [path for recording in self.recordings for path in recording.files]
 
     @property
     def is_earlier(self) -> bool:
@@ -130,12 +167,19 @@ class Reference:
         return replace(part.cloud, expected=laid_under(scan, part.cloud, part.mask, known))
 
 
-def reference_of(
-    arguments: argparse.Namespace, opened: Opened, config: AnyCrop, marks: MarksConfig
-) -> Reference:
+Reference = DrawnReference | CapturedReference
+
+
+def drawn_reference(source: DrawingFile) -> DrawnReference:
+    """Read the mesh of --reference. Raises UserError."""
+    return DrawnReference(Path(source.file), read_drawing(source))
+
+
+def captured_reference(
+    path: Path, opened: Opened, config: AnyCrop, marks: MarksConfig
+) -> CapturedReference:
     """Open and average the captures of --reference, and find the part in each by ``config``.
     Raises UserError."""
-    path = arguments.reference
     captures = captures_in(path)
     if len(captures) > MOST_PARTS:
         raise UserError(
@@ -154,11 +198,11 @@ def reference_of(
     first = parts[0].scan
     if not captures:
         earlier = replace(first, name=f"the earlier capture {path.name}")
-        return Reference(path, recordings, parts, earlier, None)
+        return CapturedReference(path, recordings, parts, earlier, None)
     others = [(part.scan, pose_by_marks(part, parts[0])) for part in parts[1:]]
     stack = good_parts(first, others, parts[0].cloud.projection == "central")
     name = f"{many(len(parts), 'good part')} in {path.name}"
-    return Reference(path, recordings, parts, stack.mean(name), stack)
+    return CapturedReference(path, recordings, parts, stack.mean(name), stack)
 
 
 # ---------------------------------------------------------------- leaving one part out
@@ -186,7 +230,7 @@ class CheckOnParts:
 
 
 def checked_on_parts(
-    reference: Reference,
+    reference: CapturedReference,
     detector: Detector,
     judged: Callable[[Detector, Cloud], tuple[float, Evidence]],
     calls: float,

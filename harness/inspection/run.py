@@ -30,7 +30,15 @@ from harness.inspection.choosing import Contender, candidate_of, chosen, noted
 from harness.inspection.judging import analysed, judged, refuse_thresholds, threshold_of
 from harness.inspection.limit import Limit, limit_of
 from harness.inspection.reference_page import changes_section, decision_section
-from harness.inspection.references import Reference, SeenPart, checked_on_parts, reference_of, seen
+from harness.inspection.references import (
+    CapturedReference,
+    Reference,
+    SeenPart,
+    captured_reference,
+    checked_on_parts,
+    drawn_reference,
+    seen,
+)
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
 from harness.inspection.tolerance import (
     PartDecision,
@@ -98,7 +106,7 @@ class Inspection:
     limit: Limit | None
     """The sizes that would have been missed; None if they were not asked for."""
     reference: Reference | None
-    """The captures that the part is compared with; None for a drawing, or without a reference."""
+    """What the part is compared with; None without a reference."""
     changes: Changes | None
     """What changed since an earlier capture; None without one."""
     decision: PartDecision | None
@@ -132,7 +140,7 @@ class _Captured:
     cloud: Cloud
     """What is judged: the average, or the map."""
     reference: Reference | None
-    """What it is compared with; None for a drawing, or without a reference."""
+    """What it is compared with; None without a reference."""
 
 
 def inspected(arguments: argparse.Namespace) -> Inspection:
@@ -231,10 +239,12 @@ def _reference(
     detector: Detector,
     flat_field: FlatField | None,
 ) -> Reference | None:
-    """Open the captures of --reference; None without them, or for a drawing. The part is cut out of
-    each as it is out of the capture, or out of each view."""
-    if arguments.reference is None or cli.is_mesh(arguments.reference):
+    """Open --reference; None without it. The part is cut out of each capture as it is out of the
+    capture to be judged, or out of each view."""
+    if arguments.reference is None:
         return None
+    if cli.is_mesh(arguments.reference):
+        return drawn_reference(cli.drawing_file_of(arguments))
 
     def opened(path: Path) -> tuple[Recording, Cloud]:
         cloud_of_result = path / outputs.CLOUD.name
@@ -248,7 +258,7 @@ def _reference(
 
     settings = config or getattr(detector, "settings", None)
     crop = getattr(settings, "crop", NoCrop())
-    return reference_of(arguments, opened, crop, cli.marks_of(arguments))
+    return captured_reference(arguments.reference, opened, crop, cli.marks_of(arguments))
 
 
 def _part(arguments: argparse.Namespace, detector: Detector, cloud: Cloud) -> SeenPart:
@@ -267,7 +277,7 @@ def _changes(
     """Return what changed since an earlier capture: that and this one are also judged by
     themselves, for the sizes of damage then and now."""
     reference = capture.reference
-    if reference is None or not reference.is_earlier:
+    if not isinstance(reference, CapturedReference) or not reference.is_earlier:
         return None
     alone = argparse.Namespace(**vars(arguments))
     alone.reference = None
@@ -302,6 +312,8 @@ def _chosen(
         """Return a detector's lowest threshold that is silent on the quiet capture, and its
         origin."""
         undamaged = quiet_cloud()
+        if capture.reference is not None:
+            undamaged = capture.reference.under(_part(arguments, detector, undamaged))
         threshold = detector.quiet_threshold(undamaged, detector.analyse(undamaged))
         frames = f"{undamaged.n_frames} frames, here {capture.cloud.n_frames}"
         quiet = f"{arguments.quiet_capture}, one repeat of {frames}"
@@ -310,10 +322,9 @@ def _chosen(
     candidates = [
         candidate_of(arguments, loaded, capture.cloud, silent_threshold) for loaded in detectors
     ]
-    if capture.reference is not None and arguments.threshold is None:
-        candidates = [
-            _with_left_out(arguments, capture.reference, candidate) for candidate in candidates
-        ]
+    reference = capture.reference
+    if isinstance(reference, CapturedReference) and arguments.threshold is None:
+        candidates = [_with_left_out(arguments, reference, candidate) for candidate in candidates]
     if arguments.detector != cli.DEFAULT_DETECTOR:
         return candidates[0]
     if arguments.threshold is not None:
@@ -322,7 +333,7 @@ def _chosen(
 
 
 def _with_left_out(
-    arguments: argparse.Namespace, reference: Reference, candidate: Contender
+    arguments: argparse.Namespace, reference: CapturedReference, candidate: Contender
 ) -> Contender:
     """Raise a candidate's threshold if it has more findings on good parts than expected."""
 
@@ -390,14 +401,13 @@ def _detectors_of(
 ) -> list[tuple[Detector, dict[str, Any]]]:
     """Return the detectors to choose from, and their settings. With several views the target is cut
     out of each view, and settings of the map are not the detector's."""
-    if config is None:
-        return cli.detectors_of(arguments, arguments.crop, arguments.set)
-    return cli.detectors_of(arguments, "none", _own_settings(arguments))
+    crop = arguments.crop if config is None else "none"
+    return cli.detectors_of(arguments, crop, _own_settings(arguments))
 
 
 def _own_settings(arguments: argparse.Namespace) -> list[str]:
     """Return the assignments of --set that are the detector's."""
-    return [assignment for assignment in arguments.set if not assignment.startswith(cli.PREFIX)]
+    return [assignment for assignment in arguments.set if not assignment.startswith(cli.PREFIXES)]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -584,9 +594,9 @@ def _facts(run: Inspection, command: str, further_inputs: Sequence[Path]) -> dic
         "settings": run.settings,
     }
     recordings = [*run.recordings, *run.quiet_recordings]
-    if run.reference is not None:
-        recordings += run.reference.recordings
     inputs = [path for recording in recordings for path in recording.files]
+    if run.reference is not None:
+        inputs += run.reference.files
     for path in (arguments.poses, arguments.flat_field, *further_inputs):
         if path:
             inputs.append(path)
@@ -691,7 +701,7 @@ def _conditions(run: Inspection) -> str:
         parts.append(f"{distance_m:.2f} m away")
     parts.append(f"detector {run.detector.name} {run.detector.version}")
     if run.reference is not None:
-        parts.append(f"compared with {run.reference.scan.name}")
+        parts.append(f"compared with {run.reference.name}")
     return ", ".join(parts)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import norm
 
 from detectors.findings.family import DEPTH_ERROR
-from detectors.interface import Detection, Detector, Evidence
+from detectors.interface import Detection, Detector
 from harness.inspection.changes import GONE, SHRUNK, Changes
 from harness.inspection.limit import Limit, SizeCount, found_at, limit_of
 from harness.inspection.verdict import DOUBTFUL, FEATURE
@@ -91,17 +91,19 @@ class FindingDecision:
     """The measured size."""
     contributions: tuple[Contribution, ...]
     """Of its standard uncertainty; empty if that is unknown."""
+    uncertainty_mm: float
+    """Combined standard uncertainty; NaN if it is unknown."""
     decision: str
     """One of `DECISIONS`."""
     reason: str
     """Why nobody can tell although the guard band would; else empty."""
 
-    @property
-    def uncertainty_mm(self) -> float:
-        """Combined standard uncertainty; NaN if it is unknown."""
-        if not self.contributions:
-            return math.nan
-        return math.hypot(*(contribution.mm for contribution in self.contributions))
+
+def combined_mm(contributions: Sequence[Contribution]) -> float:
+    """Return the combined standard uncertainty; NaN without contributions."""
+    if not contributions:
+        return math.nan
+    return math.hypot(*(contribution.mm for contribution in contributions))
 
 
 def decided(value_mm: float, uncertainty_mm: float, limit_mm: float) -> str:
@@ -214,7 +216,6 @@ class PartDecision:
         findings = []
         for finding in self.findings:
             facts = asdict(finding)
-            facts["uncertainty_mm"] = finding.uncertainty_mm
             facts["guard_band_mm"] = GUARD * finding.uncertainty_mm
             findings.append(facts)
         return {
@@ -261,10 +262,11 @@ def _on_finding(
     """Decide on one finding by one tolerance."""
     if tolerance.kind == "depth":
         value_mm = abs(finding.depth_mm)
-        contributions = _of_depth(result.cloud, result.evidence, finding, detection)
+        contributions = _of_depth(result.cloud, finding, detection)
     else:
         value_mm = finding.length_mm if finding.is_long else finding.diameter_mm
         contributions = _of_width(finding)
+    uncertainty_mm = combined_mm(contributions)
     decision = UNDECIDED
     reason = ""
     if not math.isfinite(value_mm):
@@ -272,7 +274,6 @@ def _on_finding(
     elif not contributions:
         reason = f"the uncertainty of its {tolerance.kind} is not known"
     else:
-        uncertainty_mm = math.hypot(*(contribution.mm for contribution in contributions))
         decision = decided(value_mm, uncertainty_mm, tolerance.limit_mm)
         reason = _doubt(finding, tolerance, decision)
         if reason:
@@ -282,6 +283,7 @@ def _on_finding(
         kind=tolerance.kind,
         value_mm=value_mm,
         contributions=contributions,
+        uncertainty_mm=uncertainty_mm,
         decision=decision,
         reason=reason,
     )
@@ -298,9 +300,7 @@ def _doubt(finding: Finding, tolerance: Tolerance, decision: str) -> str:
     return ""
 
 
-def _of_depth(
-    cloud: Cloud, evidence: Evidence, finding: Finding, detection: Detection
-) -> tuple[Contribution, ...]:
+def _of_depth(cloud: Cloud, finding: Finding, detection: Detection) -> tuple[Contribution, ...]:
     """Return the contributions to the standard uncertainty of a depth; none if it is unknown."""
     if not math.isfinite(finding.depth_se_mm):
         return ()
@@ -318,9 +318,6 @@ def _of_depth(
             Contribution("reference: noise, and how parts differ", _spread_mm(cloud, points_m)),
             Contribution("registration", _registration_mm(cloud, points_m)),
         ]
-    elif "standard_error_m" in evidence.notes.get("reference", {}):
-        error_mm = evidence.notes["reference"]["standard_error_m"] / MM
-        contributions.append(Contribution("registration", error_mm))
     # floor and surface are measured by the same pixels' rays
     contributions.append(Contribution("offset of the unit, which floor and surface share", 0.0))
     return tuple(contributions)

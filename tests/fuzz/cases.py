@@ -96,7 +96,7 @@ CAPTURES = (
 REFERENCES = tuple(
     Case(
         "detect",
-        f"pngs {LOCAL} --reference parts/{name} --set surface.reference.unit=mm",
+        f"pngs {LOCAL} --reference parts/{name} --set reference.unit=mm",
         ["pngs", "parts"],
         [f"parts/{name}"],
         weight=4,

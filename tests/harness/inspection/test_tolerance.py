@@ -24,6 +24,7 @@ from harness.inspection.tolerance import (
     PartDecision,
     Tolerance,
     _doubt,
+    combined_mm,
     decided,
     tolerances_from,
 )
@@ -62,11 +63,20 @@ def test_a_size_at_the_limit_is_decided_wrongly_as_often_as_stated() -> None:
 
 def on(number: int, decision: str) -> FindingDecision:
     parts = (Contribution("fit", 0.03), Contribution("model", 0.04))
-    return FindingDecision(number, "depth", 0.6, parts, decision, "")
+    return FindingDecision(
+        id=number,
+        kind="depth",
+        value_mm=0.6,
+        contributions=parts,
+        uncertainty_mm=combined_mm(parts),
+        decision=decision,
+        reason="",
+    )
 
 
 def test_contributions_add_as_squares() -> None:
     assert on(1, FAILS).uncertainty_mm == pytest.approx(0.05)
+    assert math.isnan(combined_mm(()))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ is damage."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from detectors import load_detector
-from detectors.surfaces.reference import front_of, laid_on
-from detectors.surfaces.surface import ReferenceConfig
+from detectors.surfaces.drawing import DrawingFile, drawing_under, read_drawing
 from harness.detect import main
-from harness.inspection.arguments import detector_of
+from harness.inspection.arguments import detector_of, drawing_file_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Lens, Reason, Region, transform_points
 
@@ -40,7 +40,7 @@ def seen(path: Path, T_camera_part: np.ndarray, noise_mm: float, dent_mm: float 
     """A cloud of the casting, with a round dent in its plain face at (0, 15) mm, 16 mm wide."""
     import open3d as o3d
 
-    corners = front_of(ReferenceConfig(file=str(path))).corners_m
+    corners = read_drawing(DrawingFile(file=str(path))).triangles.corners_m
     scene = o3d.t.geometry.RaycastingScene()
     moved = transform_points(T_camera_part, corners.reshape(-1, 3)).astype(np.float32)
     faces = np.arange(len(moved), dtype=np.uint32).reshape(-1, 3)
@@ -93,18 +93,18 @@ def test_a_part_is_found_where_it_lies(
     quarter: int,
 ) -> None:
     path = casting(tmp_path / "casting.stl")
-    reference = ReferenceConfig(file=str(path))
+    drawing = read_drawing(DrawingFile(file=str(path)))
     T = stood(turn_deg, quarter)
     cloud = seen(path, T, 0.5, dent_mm=3.0)
     true = seen(path, T, 0.0)
     points = cloud.points_m[cloud.valid]
-    surface = laid_on(points, reference, central=True)
+    surface = drawing_under(drawing, points, central=True)
     off_m = np.abs(surface.z_at(points) - true.points_m[cloud.valid][:, 2])
     assert np.isnan(off_m).mean() < 0.25  # along outline, steps and edges
     assert np.nanmedian(off_m) < 0.05 * MM  # a tenth of the noise of a pixel
     assert np.nanquantile(off_m, 0.95) < 0.1 * MM
     assert "casting.stl" in surface.text
-    level = laid_on(points, reference, central=False)  # of a map, along z
+    level = drawing_under(drawing, points, central=False)  # of a map, along z
     noise_m = np.nanmedian(np.abs(level.z_at(points) - points[:, 2])) / 0.6745
     assert noise_m == pytest.approx(0.5 * MM, rel=0.15)
 
@@ -121,6 +121,9 @@ def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> Non
     path = casting(tmp_path / "casting.stl")
     T = stood((6, -8, 3))
     cloud = seen(path, T, 0.5, dent_mm=3.0)
+    drawing = read_drawing(DrawingFile(file=str(path)))
+    points_m = cloud.points_m[cloud.valid]
+    cloud = replace(cloud, expected=drawing_under(drawing, points_m, central=True))
 
     def damage_mm(surface: dict[str, object]) -> list[np.ndarray]:
         measuring = load_detector(detector, {"crop": {"kind": "none"}, "surface": surface})
@@ -128,22 +131,20 @@ def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> Non
         T_part_camera = np.linalg.inv(T)
         return [transform_points(T_part_camera, finding.centre_m) / MM for finding in findings]
 
-    (centre,) = damage_mm({"shape": "mesh", "reference": {"file": str(path)}})
+    (centre,) = damage_mm({"shape": "expected"})
     assert np.linalg.norm(centre[:2] - (0, 15)) < 3.0
     # ribs pass for damage where nothing is known of the part
     assert len(damage_mm({"shape": "auto"})) > 1
 
 
 def test_mistakes_are_told(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="need each other"):
-        load_detector("local", {"surface": {"shape": "mesh"}})
     sheet = trimesh.Trimesh([(0, 0, 0), (10, 0, 0), (0, 10, 0)], [(0, 2, 1)])
     away = tmp_path / "away.stl"
     sheet.export(away)
     with pytest.raises(UserError, match="none of its triangles faces"):
-        front_of(ReferenceConfig(file=str(away)))
+        read_drawing(DrawingFile(file=str(away)))
     with pytest.raises(UserError, match="cannot be read"):
-        front_of(ReferenceConfig(file=str(tmp_path / "none.stl")))
+        read_drawing(DrawingFile(file=str(tmp_path / "none.stl")))
 
 
 def test_a_wrong_unit_and_a_wrong_part_are_told(tmp_path: Path) -> None:
@@ -155,22 +156,27 @@ def test_a_wrong_unit_and_a_wrong_part_are_told(tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match=r"is 0\.\d+ mm large in mm, and the target 2\d\d mm"
     ) as told:
-        laid_on(points, ReferenceConfig(file=str(metres)), central=True)
-    assert told.value.fix == "state its unit, if it is m: surface.reference.unit=m"
+        drawing_under(read_drawing(DrawingFile(file=str(metres))), points, central=True)
+    assert told.value.fix == "state its unit, if it is m: reference.unit=m"
     with pytest.raises(UserError, match="mm large in m, and the target"):
-        laid_on(points, ReferenceConfig(file=str(path), unit="m"), central=True)
+        drawing_under(read_drawing(DrawingFile(file=str(path), unit="m")), points, central=True)
     ball = tmp_path / "ball.stl"
     trimesh.creation.icosphere(3, 110.0).export(ball)
     with pytest.raises(UserError, match="is not this part: "):
-        laid_on(points, ReferenceConfig(file=str(ball)), central=True)
+        drawing_under(read_drawing(DrawingFile(file=str(ball))), points, central=True)
 
 
-def test_a_reference_is_stated_on_the_command_line(tmp_path: Path) -> None:
+def test_a_reference_is_stated_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = casting(tmp_path / "casting.stl")
-    unit = "surface.reference.unit=cm"
-    arguments = ["capture", "--reference", str(path), "--set", unit]
-    _, settings = detector_of(main.parser().parse_args(arguments), "none", [unit])
-    assert settings["surface"]["reference"] == {"file": str(path), "unit": "cm", "front": "+z"}
-    options = main.parser().parse_args([*arguments, "--detector", "plane_ransac"])
+    unit = "reference.unit=cm"
+    options = main.parser().parse_args(["capture", "--reference", str(path), "--set", unit])
+    assert drawing_file_of(options) == DrawingFile(file=str(path), unit="cm")
+    _, settings = detector_of(options, "none", [])
+    assert settings["surface"]["shape"] == "expected"
+    options.detector = "plane_ransac"
     with pytest.raises(UserError, match="has no surface setting"):
         detector_of(options, "none", [])
+    assert main(["capture", "--set", unit]) == 2
+    assert "name it with --reference part.stl" in capsys.readouterr().err
