@@ -37,6 +37,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="camera pose for each PATH, as for tofpod detect",
     )
+    sphere_help = (
+        "only find and measure spheres of this diameter, such as 145mm: errors of size and form, "
+        "and spacings; a single frame will do"
+    )
+    add("--spheres", metavar="DIAMETER", help=sphere_help)
     add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
     add(
         "--rate",
@@ -94,6 +99,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.camera.certificate import write_certificate
     from harness.programs.camera.measure import characteristics, read_still
     from harness.programs.camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
+    from harness.programs.camera.spheres import run_spheres
     from scenes.sensor.camera import load_camera
 
     if not 0 < options.albedo <= 1:
@@ -111,6 +117,8 @@ def main(options: argparse.Namespace, command: str) -> int:
     study = read_record(options.study) if options.study else None
     poses = read_poses(options.poses, len(options.paths)) if options.poses else None
     refuse_repeats(options.paths)
+    if options.spheres:
+        return run_spheres(options, command)
     recordings = [
         opened_as(options.like, [path], options.intrinsics, **reading_of(options))
         for path in options.paths

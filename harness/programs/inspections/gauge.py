@@ -34,12 +34,22 @@ HIT_SHARE = 0.4
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
+    solid = parser.add_mutually_exclusive_group()
+    solid.add_argument(
+        "--print",
+        action="store_true",
+        dest="printed",
+        help="write a solid gauge with spheres, steps, grooves and pockets for a printer's bed of "
+        "200 mm, for tofpod characterise --gauge",
+    )
+    solid.add_argument(
+        "--cut", action="store_true", help="the same, 1.5 times as large, for a milling machine"
+    )
     add(
         "--diameters",
-        required=True,
         type=span("mm"),
         metavar="FROM:TO",
-        help="range of drill diameters (bare numbers: mm)",
+        help="range of drill diameters of drilled boards (bare numbers: mm)",
     )
     add(
         "--depths",
@@ -86,7 +96,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder for template.pdf, board-N.svg and gauge.json",
+        help="folder for template.pdf, board-N.svg and gauge.json, or for a solid gauge's files",
     )
 
 
@@ -94,9 +104,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the "
     "limit that tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), "
-    "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs.",
+    "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs. Or, with "
+    "--print or --cut, write a solid gauge that measures range itself: gauge.stl, gauge.3mf, a "
+    "drawing, gauge.json, and calliper.csv to fill in.",
     "tofpod gauge --diameters 2:12 --a50 4 --a90 6 --out gauge",
-    "tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out gauge",
+    "tofpod gauge --print --out gauge",
     epilog="The holes are drilled, the board is recorded, and tofpod gauge read finds them.",
     further={"read": READ},
 )
@@ -108,6 +120,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.inspections.mapod import PRIOR_SIZE
     from harness.vocabulary.files import write_bytes, write_text
 
+    if options.printed or options.cut:
+        return _write_solid(options)
+    if options.diameters is None:
+        raise UserError("drilled boards need --diameters", fix="or choose --print, or --cut")
     low, high = options.diameters
     if not DRILLS_MM <= low < high < LARGEST_MM:
         raise UserError(
@@ -152,6 +168,34 @@ def main(options: argparse.Namespace, command: str) -> int:
     print(
         f"wrote {options.out / 'template.pdf'}, {len(gauge.boards)} SVG, gauge.json; print at 100 %"
     )
+    return 0
+
+
+def _write_solid(options: argparse.Namespace) -> int:
+    """Write a solid gauge, and say how its marks become black. Returns 0."""
+    from harness.programs.inspections.gauge_solid import designed, write_solid
+
+    drilled = {"--diameters": options.diameters, "--depths": options.depths}
+    drilled |= {"--study": options.study, "--a50": options.a50, "--a90": options.a90}
+    if useless := [option for option, value in drilled.items() if value is not None]:
+        raise UserError(
+            f"{useless[0]} belongs to drilled boards", fix="leave it out, or --print and --cut"
+        )
+    gauge = designed(options.cut)
+    names = write_solid(options.out, gauge)
+    tallest_mm = max(ball.z_mm + ball.diameter_mm / 2 for ball in gauge.spheres)
+    print(
+        f"gauge: {gauge.width_mm:g} x {gauge.height_mm:g} mm, {tallest_mm + gauge.thickness_mm:g} "
+        f"mm tall: {len(gauge.spheres)} spheres, {len(gauge.steps)} steps, {len(gauge.grooves)} "
+        f"grooves, {len(gauge.pockets)} pockets"
+    )
+    fill = "the second part of gauge.3mf fills them in black; " if options.printed else ""
+    print(
+        f"marks: the black modules are recessed by {gauge.mark_depth_mm:g} mm: {fill}else paint "
+        "them, or stick on the marks of gauge.svg, printed at 100 %"
+    )
+    print("make it matte and light; write the sizes that a calliper shows into calliper.csv")
+    print(f"wrote {', '.join(names)} to {options.out}")
     return 0
 
 

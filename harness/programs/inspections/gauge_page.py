@@ -48,23 +48,11 @@ def tiles_of(
 def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
     """Draw a `GaugeBoard` in millimetres about its centre: outline, coded marks, holes with centre
     marks, and names."""
-    import cv2
     from matplotlib.patches import Circle, Rectangle
 
     corner = (-board.width_mm / 2, -board.height_mm / 2)
     axes.add_patch(Rectangle(corner, board.width_mm, board.height_mm, fill=False, ec=INK, lw=0.6))
-    marker_codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    for mark in board.marks:
-        modules = marker_codes.markerSize + 2
-        picture = cv2.aruco.generateImageMarker(marker_codes, mark.code, modules)
-        step = mark.side_mm / modules
-        for row, column in np.argwhere(picture == 0).tolist():
-            corner = (
-                mark.x_mm - mark.side_mm / 2 + column * step,
-                mark.y_mm + mark.side_mm / 2 - (row + 1) * step,
-            )
-            # without edges, hairlines would show between neighbouring modules
-            axes.add_patch(Rectangle(corner, step, step, fc="black", ec="black", lw=0.1))
+    draw_marks(axes, board.marks, dictionary)
     for hole in board.holes:
         x = hole.x_mm
         y = hole.y_mm
@@ -78,12 +66,36 @@ def draw_board(axes: Axes, board: Any, dictionary: str) -> None:
         axes.annotate(text, (x, y - reach - 0.5), **style)
 
 
+def draw_marks(axes: Axes, marks: Any, dictionary: str) -> None:
+    """Draw coded marks with a code, a centre and a side in millimetres."""
+    import cv2
+    from matplotlib.patches import Rectangle
+
+    marker_codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    for mark in marks:
+        modules = marker_codes.markerSize + 2
+        picture = cv2.aruco.generateImageMarker(marker_codes, mark.code, modules)
+        step = mark.side_mm / modules
+        for row, column in np.argwhere(picture == 0).tolist():
+            corner = (
+                mark.x_mm - mark.side_mm / 2 + column * step,
+                mark.y_mm + mark.side_mm / 2 - (row + 1) * step,
+            )
+            # without edges, hairlines would show between neighbouring modules
+            axes.add_patch(Rectangle(corner, step, step, fc="black", ec="black", lw=0.1))
+
+
 def template_svg(board: Any, dictionary: str) -> bytes:
     """Return a board as a drawing of the same size."""
     wide = board.width_mm + 2
     high = board.height_mm + 2
-    figure, axes = _sheet((-wide / 2, -high / 2, wide, high), board.name)
+    figure, axes = sheet((-wide / 2, -high / 2, wide, high), board.name)
     draw_board(axes, board, dictionary)
+    return svg_of(figure)
+
+
+def svg_of(figure: Figure) -> bytes:
+    """Return a figure as SVG text without a date."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
@@ -106,7 +118,7 @@ def template_pdf(boards: Any, dictionary: str, paper: str) -> bytes:
                 left_mm = x - board.width_mm / 2
                 low = y - board.height_mm / 2
                 sheet_mm = (left_mm - MARGIN_MM, low - MARGIN_MM - FOOT_MM, sheet_wide, sheet_high)
-                figure, axes = _sheet(sheet_mm, board.name)
+                figure, axes = sheet(sheet_mm, board.name)
                 draw_board(axes, board, dictionary)
                 title = f"{board.name}, tile {number} of {len(tile_corners)}: print at 100 %"
                 _frame(axes, (left_mm, low, wide, high), title)
@@ -135,7 +147,7 @@ def _frame(axes: Axes, box_mm: tuple[float, float, float, float], title: str) ->
     axes.annotate(text, (left_mm + SCALE_MM + 3, bar), fontsize=7, color=INK, va="center")
 
 
-def _sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:
+def sheet(view_mm: tuple[float, float, float, float], name: str) -> tuple[Figure, Axes]:
     """Return a figure that shows a box (left, low, width, height) in mm at a scale of 1:1; its
     axes fill it."""
     from matplotlib import rcParams

@@ -1,0 +1,111 @@
+"""Spheres in range images: where they are, how large, and how certain that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.stills.spheres import (
+    FEWEST_PX,
+    NoFit,
+    RangeImage,
+    SphereFit,
+    correlated_pixels,
+    disc,
+    farthest_m,
+    find_spheres,
+    fit_sphere,
+)
+from tests.support.spheres import LENS, sphere_scene
+
+RADIUS_M = 0.0725
+CENTRES_M = np.array([[-0.2, 0.05, 1.0], [0.25, -0.1, 1.2]])
+DRAWS = 40
+
+
+def test_spheres_without_noise_are_found_exactly():
+    fits = find_spheres(sphere_scene(CENTRES_M, RADIUS_M), RADIUS_M)
+    assert len(fits) == 2
+    for fit, centre_m in zip(fits, CENTRES_M, strict=True):
+        assert fit.centre_m == pytest.approx(centre_m, abs=1e-6)
+        assert fit.radius_m == pytest.approx(RADIUS_M, abs=1e-6)
+        assert fit.seen_share == 1
+
+
+@pytest.mark.parametrize(("missing", "blur_px"), [(0.0, 0.0), (0.5, 0.0), (0.0, 0.8)])
+def test_centre_and_diameter_are_unbiased_and_as_certain_as_they_say(missing, blur_px):
+    """Over draws, the mean error is 0 within three standard errors, and errors scatter as stated,
+    with half of the pixels lost, and with the noise of neighbours correlated."""
+    centre_errors = []
+    size_errors = []
+    for seed in range(DRAWS):
+        image = sphere_scene(CENTRES_M, RADIUS_M, 3e-3, missing, seed, blur_px)
+        fit = fit_sphere(image, CENTRES_M[0] + 0.02, RADIUS_M)
+        assert isinstance(fit, SphereFit)
+        sigmas_m = np.sqrt(np.diag(fit.covariance_m2))
+        centre_errors.append((fit.centre_m - CENTRES_M[0]) / sigmas_m)
+        size_errors.append(fit.size_error_m / 2 / fit.radius_sigma_m)
+    errors = np.column_stack([centre_errors, size_errors])
+    assert (np.abs(errors.mean(axis=0)) < 3 / np.sqrt(DRAWS)).all()
+    scatter = errors.std(axis=0)
+    assert (scatter > 0.7).all()
+    assert (scatter < 1.35).all()
+
+
+def test_half_of_the_pixels_and_much_noise_leave_the_spheres():
+    image = sphere_scene(CENTRES_M, RADIUS_M, 8e-3, 0.5, seed=3)
+    fits = find_spheres(image, RADIUS_M)
+    assert len(fits) == 2
+    for fit, centre_m in zip(fits, CENTRES_M, strict=True):
+        assert np.linalg.norm(fit.centre_m - centre_m) < 5e-3
+        assert 0.4 < fit.seen_share < 0.6
+
+
+@pytest.mark.parametrize("sigma_m", [1e-3, 20e-3])
+def test_nothing_is_a_sphere_that_is_none(sigma_m: float):
+    """Neither wall, floor and their corner, nor a sphere of another size, nor noise."""
+    assert find_spheres(sphere_scene(CENTRES_M[:0], RADIUS_M, sigma_m), RADIUS_M) == []
+    image = sphere_scene(CENTRES_M, 2.5 * RADIUS_M, sigma_m / 10)
+    assert find_spheres(image, RADIUS_M) == []
+
+
+def test_too_few_pixels_give_no_number():
+    image = sphere_scene(CENTRES_M, RADIUS_M, 1e-3)
+    on_sphere = disc(image, CENTRES_M[0], RADIUS_M)
+    few = image.range_m.copy()
+    few.ravel()[on_sphere[FEWEST_PX - 1 :]] = np.nan
+    fit = fit_sphere(RangeImage(few, image.rays), CENTRES_M[0], RADIUS_M)
+    assert isinstance(fit, NoFit)
+    assert fit.why == "39 pixels with a range, 40 needed"
+    left = image.range_m.copy()
+    left.ravel()[on_sphere[on_sphere % LENS.width > 60]] = np.nan
+    fit = fit_sphere(RangeImage(left, image.rays), CENTRES_M[0], RADIUS_M)
+    assert isinstance(fit, NoFit)
+    assert fit.why == "its pixels lie on one side of it"
+
+
+def test_the_farthest_distance_is_that_of_the_fewest_pixels():
+    image = sphere_scene(CENTRES_M[:0], RADIUS_M)
+    limit_m = farthest_m(image.pitch_rad, RADIUS_M)
+    counts = [len(disc(image, np.array([0, 0, limit_m * far]), RADIUS_M)) for far in (0.9, 1.1)]
+    assert counts[0] > FEWEST_PX > counts[1]
+
+
+def test_form_errors_are_the_shells_that_hold_the_points():
+    image = sphere_scene(CENTRES_M, RADIUS_M, 1e-3, seed=1)
+    fit = fit_sphere(image, CENTRES_M[0], RADIUS_M)
+    assert isinstance(fit, SphereFit)
+    assert fit.form_error_m(0.95) < fit.form_error_m(0.997)
+    assert fit.form_error_m(0.95) == pytest.approx(2 * 1.96 * fit.radial_m.std(), rel=0.1)
+
+
+def test_correlated_neighbours_share_an_error():
+    rng = np.random.default_rng(0)
+    pixels = np.arange(60 * 60)
+    shared = []
+    for _ in range(10):
+        white = rng.standard_normal((60, 60))
+        pairs = np.repeat(np.repeat(white[::2, ::2], 2, axis=0), 2, axis=1)
+        of_white = correlated_pixels((60, 60), pixels, white.ravel())
+        shared.append((of_white, correlated_pixels((60, 60), pixels, pairs.ravel())))
+    assert np.mean(shared, axis=0) == pytest.approx([1, 4], rel=0.25)
