@@ -20,17 +20,19 @@ DISTANCES_M = (0.3, 0.9, 2.7)
 DEPTHS_MM = {"through": (None,), "blind": (2.0, 8.0), "dent": (0.5, 2.0), "slot": (2.0, 8.0)}
 
 
-def noise_mm(camera: str, place: Conditions) -> float:
+def noise_mm(camera: str, conditions: Conditions) -> float:
     """The noise of an average: that of a frame grows with the distance and falls with albedo."""
-    frame_mm = (2.0 if camera == "dim" else 1.0) * place.distance_m / np.sqrt(place.albedo)
-    return float(np.hypot(frame_mm / np.sqrt(place.frames), FIXED_MM))
+    frame_mm = (
+        (2.0 if camera == "dim" else 1.0) * conditions.distance_m / np.sqrt(conditions.albedo)
+    )
+    return float(np.hypot(frame_mm / np.sqrt(conditions.frames), FIXED_MM))
 
 
-def law_mm(camera: str, place: Conditions) -> float:
+def law_mm(camera: str, conditions: Conditions) -> float:
     """a90 of a made-up camera: 2.5 pixels at equal noise and depth, with bends that are no
     polynomials of x."""
-    ratio = noise_mm(camera, place) / (place.depth_mm or CONTRAST_MM)
-    pixel_mm = place.distance_m / 500.0 * 1e3
+    ratio = noise_mm(camera, conditions) / (conditions.depth_mm or CONTRAST_MM)
+    pixel_mm = conditions.distance_m / 500.0 * 1e3
     return float(pixel_mm * (1.0 + 2.5 * ratio**0.6))
 
 
@@ -46,12 +48,12 @@ def noise_table(camera: str) -> PlaneNoise:
     return PlaneNoise(distances_m, albedos, frame_mm, np.full_like(frame_mm, FIXED_MM))
 
 
-def set_up(camera: str, kind: str, place: Conditions, stream: np.random.Generator) -> SetUp:
+def set_up(camera: str, kind: str, conditions: Conditions, stream: np.random.Generator) -> SetUp:
     """A limit of the law with an error that its interval states."""
-    a90_mm = law_mm(camera, place) * float(np.exp(stream.normal(0, SCATTER)))
+    a90_mm = law_mm(camera, conditions) * float(np.exp(stream.normal(0, SCATTER)))
     return SetUp(
         kind=kind,
-        place=place,
+        conditions=conditions,
         a90_mm=a90_mm,
         low_mm=a90_mm * float(np.exp(-1.96 * SCATTER)),
         high_mm=a90_mm * float(np.exp(1.96 * SCATTER)),
@@ -71,8 +73,8 @@ def shard(camera: str, seed: int = 1) -> CameraLimits:
             for distance_m in DISTANCES_M:
                 for albedo in (0.1, 0.9):
                     for frames in (1, 50):
-                        place = Conditions(distance_m, albedo, frames, depth_mm)
-                        set_ups.append(set_up(camera, kind, place, stream))
+                        conditions = Conditions(distance_m, albedo, frames, depth_mm)
+                        set_ups.append(set_up(camera, kind, conditions, stream))
     about = {
         "versions": {"tofpod": __version__},
         "digests": {},

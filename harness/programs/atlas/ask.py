@@ -114,28 +114,28 @@ def main(options: argparse.Namespace, command: str) -> int:
     surfaces = [surface for shard, name in chosen for surface in shard.surfaces(kind, name)]
     if not surfaces:
         raise UserError(f"--damage {options.damage}: is not in this atlas")
-    places = _places(options, kind, surfaces)
+    asked = _asked(options, kind, surfaces)
     size_mm = math.nan if options.size is None else 1e3 * length_m("--size", options.size)
-    rows, reasons = _answers(surfaces, places, size_mm)
+    rows, reasons = _answers(surfaces, asked, size_mm)
     if not rows:
         raise UserError(
             f"the atlas does not cover this: {'; '.join(reasons)}",
-            fix=f"compute it: {_exactly(surfaces[0], places[0])}",
+            fix=f"compute it: {_exactly(surfaces[0], asked[0])}",
         )
     warnings = _warnings(used.values())
-    answer = _headline(kind, places, rows, size_mm)
+    answer = _headline(kind, asked, rows, size_mm)
     notes = [_basis(rows), *_assumed(kind, rows, used.values())]
     if not options.camera:
         notes += _same(used.values())
     if options.damage.lower() == "scratch":
         notes.append(SCRATCH)
     notes += [f"not answered: {reason}" for reason in reasons]
-    exact = f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].place)}"
+    exact = f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].conditions)}"
     _show(rows, answer, warnings, [*notes, exact])
     if options.out is not None:
         heads = [age, *warnings] if age else warnings
         about = next(iter(used.values())).about
-        _write_page(options.out, rows, places, answer, [heads, notes], about, command)
+        _write_page(options.out, rows, asked, answer, [heads, notes], about, command)
     return 0
 
 
@@ -218,7 +218,7 @@ def _same_numbers(path: str, every: Sequence[tuple[CameraLimits, str]]) -> tuple
     )
 
 
-def _places(
+def _asked(
     options: argparse.Namespace, kind: str, surfaces: Sequence[LimitSurface]
 ) -> list[Conditions]:
     """Return the set-ups that the question asks for; without an option, the usual ones. Raises
@@ -250,15 +250,15 @@ def _places(
 
 
 def _answers(
-    surfaces: Sequence[LimitSurface], places: Sequence[Conditions], size_mm: float
+    surfaces: Sequence[LimitSurface], asked: Sequence[Conditions], size_mm: float
 ) -> tuple[list[Row], list[str]]:
-    """Return the rows of all places, and the reasons why others have none."""
+    """Return the rows of all conditions, and the reasons why others have none."""
     from harness.programs.atlas.tables import rows_at
 
     rows: list[Row] = []
     titles_by_reason: dict[str, dict[str, None]] = {}
-    for place in places:
-        answered, refused = rows_at(surfaces, place, size_mm)
+    for conditions in asked:
+        answered, refused = rows_at(surfaces, conditions, size_mm)
         rows += answered
         for reason, title in refused:
             titles_by_reason.setdefault(reason, {})[title] = None
@@ -269,23 +269,23 @@ def _answers(
     return rows, reasons
 
 
-def _headline(kind: str, places: Sequence[Conditions], rows: Sequence[Row], size_mm: float) -> str:
+def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_mm: float) -> str:
     """Return the answer in a sentence: what is found in how many set-ups or, without a size, which
     camera finds the smallest."""
     from harness.programs.atlas.tables import DAMAGE, order
     from harness.vocabulary.text import many
 
-    place = places[0]
-    deep = "" if place.depth_mm is None else f", {place.depth_mm:g} mm deep,"
+    conditions = asked[0]
+    deep = "" if conditions.depth_mm is None else f", {conditions.depth_mm:g} mm deep,"
     if math.isnan(size_mm):
         best = min(rows, key=order)
         if math.isnan(best.answer.a90_mm):
-            return f"At {place.distance_m:g} m, no limit of {DAMAGE[kind]}s{deep} is known."
+            return f"At {conditions.distance_m:g} m, no limit of {DAMAGE[kind]}s{deep} is known."
         bound = f"{best.answer.low_mm:.2g} to {best.answer.high_mm:.2g} mm"
         return (
-            f"At {place.distance_m:g} m, {best.surface.title} finds the smallest {DAMAGE[kind]}s"
-            f"{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound}) with"
-            f" {many(best.place.frames, 'frame')} on albedo {best.place.albedo:g}."
+            f"At {conditions.distance_m:g} m, {best.surface.title} finds the smallest"
+            f" {DAMAGE[kind]}s{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound}) with"
+            f" {many(best.conditions.frames, 'frame')} on albedo {best.conditions.albedo:g}."
         )
     verdicts = [row.verdict for row in rows]
     others = []
@@ -293,7 +293,7 @@ def _headline(kind: str, places: Sequence[Conditions], rows: Sequence[Row], size
         if verdict in verdicts:
             others.append(f"{verdict} for {verdicts.count(verdict)}")
     beside = f" ({', '.join(others)})" if others else ""
-    what = f"{DAMAGE[kind].capitalize()}s of {size_mm:g} mm{deep} at {place.distance_m:g} m"
+    what = f"{DAMAGE[kind].capitalize()}s of {size_mm:g} mm{deep} at {conditions.distance_m:g} m"
     count = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}{beside}"
     return f"{what} are found nine times out of ten in {count}."
 
@@ -345,16 +345,17 @@ def _assumed(kind: str, rows: Sequence[Row], shards: Any) -> list[str]:
     if not file.is_file():
         return []
     detectors = [str(shard.about.get("detector")) for shard in shards]
-    frames = max(row.place.frames for row in rows)
-    table = pq.read_table(file).to_pylist()
+    frames = max(row.conditions.frames for row in rows)
+    # `read_table` imports pandas, which takes a third of a second
+    table = pq.ParquetFile(file).read().to_pylist()
     return assumed(table, kind, detectors[0], frames)
 
 
-def _exactly(surface: LimitSurface, place: Conditions) -> str:
+def _exactly(surface: LimitSurface, conditions: Conditions) -> str:
     """Return the command of a study that computes the set-up itself."""
     from harness.programs.atlas.parts import exact_overrides
 
-    overrides = exact_overrides(surface.camera, surface.focal_px, surface.kind, place)
+    overrides = exact_overrides(surface.camera, surface.focal_px, surface.kind, conditions)
     settings = " ".join(f"--set {shlex.quote(text)}" for text in overrides)
     return f"tofpod sweep atlas --set study.boards=36 {settings}"
 
@@ -373,7 +374,7 @@ def _show(rows: Sequence[Row], answer: str, warnings: Sequence[str], notes: Sequ
 def _write_page(
     out: Path,
     rows: Sequence[Row],
-    places: Sequence[Conditions],
+    asked: Sequence[Conditions],
     answer: str,
     texts: Sequence[Sequence[str]],
     about: Mapping[str, Any],
@@ -386,7 +387,7 @@ def _write_page(
 
     warnings, notes = texts
     surfaces = list({row.surface.camera: row.surface for row in rows}.values())
-    lines = curves(surfaces, places)
+    lines = curves(surfaces, asked)
     write_table(out, ATLAS, ATLAS.frame(lines), about)
     page = atlas_html(lines, rows, answer, warnings=warnings, notes=notes, command=command)
     write_text(out / ATLAS_PAGE.name, page)

@@ -70,7 +70,7 @@ class SetUp:
 
     kind: str
     """Kind of damage."""
-    place: Conditions
+    conditions: Conditions
     """Where it was computed."""
     a90_mm: float
     """Size found 90 % of the time; NaN if none."""
@@ -119,23 +119,23 @@ class PlaneNoise:
     fixed_mm: np.ndarray
     """(d, a): deviation of what no averaging removes; NaN likewise."""
 
-    def at(self, place: Conditions) -> float:
+    def at(self, conditions: Conditions) -> float:
         """Return the noise of an average, millimetres; logarithms of the variances are linear in
         those of distance and albedo. Raises Outside where the camera gives no depth."""
-        frame = self._between(self.frame_mm**2, place)
-        fixed = self._between(self.fixed_mm**2, place)
-        noise_mm = float(np.sqrt(frame / place.frames + fixed))
+        frame = self._between(self.frame_mm**2, conditions)
+        fixed = self._between(self.fixed_mm**2, conditions)
+        noise_mm = float(np.sqrt(frame / conditions.frames + fixed))
         if not np.isfinite(noise_mm):
             raise Outside(
-                f"distance {place.distance_m:g} m, albedo {place.albedo:g}: the camera gives no"
-                " depth there or nearby (too much light, or too little)"
+                f"distance {conditions.distance_m:g} m, albedo {conditions.albedo:g}: the camera"
+                " gives no depth there or nearby (too much light, or too little)"
             )
         return noise_mm
 
-    def _between(self, variances: np.ndarray, place: Conditions) -> float:
-        """Interpolate variances (d, a) at a place."""
-        rows, row_shares = _neighbours(self.distance_m, place.distance_m)
-        columns, column_shares = _neighbours(self.albedo, place.albedo)
+    def _between(self, variances: np.ndarray, conditions: Conditions) -> float:
+        """Interpolate variances (d, a) at conditions."""
+        rows, row_shares = _neighbours(self.distance_m, conditions.distance_m)
+        columns, column_shares = _neighbours(self.albedo, conditions.albedo)
         corners = np.log(np.maximum(variances[np.ix_(rows, columns)], TOLERANCE))
         return float(np.exp(row_shares @ corners @ column_shares))
 
@@ -154,7 +154,7 @@ def _neighbours(nodes: Sequence[float], value: float) -> tuple[list[int], np.nda
 
 @dataclass(frozen=True)
 class Answer:
-    """The limit at a place, or the bounds that are known instead."""
+    """The limit at conditions, or the bounds that are known instead."""
 
     a90_mm: float = np.nan
     """Size found 90 % of the time; NaN if it is not known."""
@@ -189,7 +189,7 @@ class Fit:
     """Root mean square error of ln a90 at each set-up when the others predict it."""
 
     def log_a90(self, x: float, log_distance: float) -> tuple[float, float]:
-        """Return ln a90 at a place, and half the width of its 95 % interval."""
+        """Return ln a90 at conditions, and half the width of its 95 % interval."""
         terms = _terms(np.array([x]), np.array([log_distance]), len(self.coefficients))[0]
         middle = float(terms @ self.coefficients)
         deviation = np.hypot(np.sqrt(terms @ self.covariance @ terms), self.error)
@@ -222,7 +222,7 @@ class LimitSurface:
         """The computed range on each axis that this kind of damage has."""
         ranges = {}
         for axis in AXES:
-            values = [getattr(set_up.place, axis) for set_up in self.set_ups]
+            values = [getattr(set_up.conditions, axis) for set_up in self.set_ups]
             if None not in values:
                 ranges[axis] = (float(min(values)), float(max(values)))
         return ranges
@@ -234,7 +234,7 @@ class LimitSurface:
         if len(limited) < LEAST_FITTED:
             return None
         x = np.array([self.ratios[set_up] for set_up in limited])
-        log_distance = np.log([set_up.place.distance_m for set_up in limited])
+        log_distance = np.log([set_up.conditions.distance_m for set_up in limited])
         log_a90 = np.log([set_up.a90_mm for set_up in limited])
         variances = np.array([set_up.variance for set_up in limited])
         return fitted(_terms(x, log_distance, _count(len(limited))), log_a90, variances)
@@ -247,27 +247,27 @@ class LimitSurface:
     @cached_property
     def ratios(self) -> dict[SetUp, float]:
         """x of each computed set-up."""
-        return {set_up: self.ratio(set_up.place) for set_up in self.set_ups}
+        return {set_up: self.ratio(set_up.conditions) for set_up in self.set_ups}
 
-    def ratio(self, place: Conditions) -> float:
+    def ratio(self, conditions: Conditions) -> float:
         """Return x: the logarithm of a pixel's noise over the damage's depth. Raises Outside."""
-        depth_mm = self.contrast_mm if place.depth_mm is None else place.depth_mm
-        return float(np.log(self.noise.at(place) / depth_mm))
+        depth_mm = self.contrast_mm if conditions.depth_mm is None else conditions.depth_mm
+        return float(np.log(self.noise.at(conditions) / depth_mm))
 
-    def at(self, place: Conditions) -> Answer:
-        """Return the limit at a place. Raises Outside beyond the computed range."""
-        self._check_inside(place)
-        x = self.ratio(place)
-        harder = self._beside(lambda other: _is_harder(other, (x, place.distance_m)))
-        easier = self._beside(lambda other: _is_harder((x, place.distance_m), other))
+    def at(self, conditions: Conditions) -> Answer:
+        """Return the limit at conditions. Raises Outside beyond the computed range."""
+        self._check_inside(conditions)
+        x = self.ratio(conditions)
+        harder = self._beside(lambda other: _is_harder(other, (x, conditions.distance_m)))
+        easier = self._beside(lambda other: _is_harder((x, conditions.distance_m), other))
         found_mm = [set_up.smallest_mm for set_up in harder if set_up.is_at_most]
         missed_mm = [set_up.largest_mm for set_up in easier if set_up.is_beyond]
         known = Answer(
             found_mm=min(found_mm, default=np.nan), missed_mm=max(missed_mm, default=np.nan)
         )
-        if self.fit is None or missed_mm or not self._is_between(x, place, harder):
+        if self.fit is None or missed_mm or not self._is_between(x, conditions, harder):
             return known
-        middle, half = self.fit.log_a90(x, float(np.log(place.distance_m)))
+        middle, half = self.fit.log_a90(x, float(np.log(conditions.distance_m)))
         return Answer(
             a90_mm=float(np.exp(middle)),
             low_mm=float(np.exp(middle - half)),
@@ -275,25 +275,27 @@ class LimitSurface:
             found_mm=known.found_mm,
         )
 
-    def _is_between(self, x: float, place: Conditions, harder: Sequence[SetUp]) -> bool:
-        """Return whether set-ups with limits stand on all sides of a place."""
+    def _is_between(self, x: float, conditions: Conditions, harder: Sequence[SetUp]) -> bool:
+        """Return whether set-ups with limits stand on all sides of conditions."""
         limited = [set_up for set_up in self.set_ups if set_up.has_limit]
-        nearest_m = min(set_up.place.distance_m for set_up in limited)
+        nearest_m = min(set_up.conditions.distance_m for set_up in limited)
         least_x = min(self.ratios[set_up] for set_up in limited)
         is_reached = any(set_up.has_limit for set_up in harder)
-        return is_reached and nearest_m <= place.distance_m + TOLERANCE and least_x <= x + SAME_X
+        return (
+            is_reached and nearest_m <= conditions.distance_m + TOLERANCE and least_x <= x + SAME_X
+        )
 
     def _beside(self, is_beside: Callable[[tuple[float, float]], bool]) -> list[SetUp]:
         """Return the set-ups whose (x, distance) meets a condition."""
         chosen = []
         for set_up in self.set_ups:
-            if is_beside((self.ratios[set_up], set_up.place.distance_m)):
+            if is_beside((self.ratios[set_up], set_up.conditions.distance_m)):
                 chosen.append(set_up)
         return chosen
 
-    def _check_inside(self, place: Conditions) -> None:
+    def _check_inside(self, conditions: Conditions) -> None:
         for axis, (lowest, highest) in self.ranges.items():
-            value = getattr(place, axis)
+            value = getattr(conditions, axis)
             if lowest * (1 - TOLERANCE) <= value <= highest * (1 + TOLERANCE):
                 continue
             unit = AXES[axis]

@@ -118,7 +118,7 @@ def set_ups_of(limits: pd.DataFrame, part: Part) -> list[SetUp]:
     set_ups = []
     for row in limits.to_dict("records"):
         kind, depth_mm = damage_of(row[DAMAGE])
-        place = Conditions(
+        conditions = Conditions(
             distance_m=part.distance_m,
             albedo=float(row[ALBEDO]),
             frames=int(row["frames"]),
@@ -127,7 +127,7 @@ def set_ups_of(limits: pd.DataFrame, part: Part) -> list[SetUp]:
         set_ups.append(
             SetUp(
                 kind=kind,
-                place=place,
+                conditions=conditions,
                 a90_mm=float(row["a90_mm"]),
                 low_mm=float(row["a90_low_mm"]),
                 high_mm=float(row["a90_high_mm"]),

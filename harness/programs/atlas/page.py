@@ -35,9 +35,9 @@ def atlas_html(
     best = rows[0]
     opens = {
         "size_mm": None if np.isnan(best.size_mm) else best.size_mm,
-        "distance_m": best.place.distance_m,
-        "frames": best.place.frames,
-        "albedo": best.place.albedo,
+        "distance_m": best.conditions.distance_m,
+        "frames": best.conditions.frames,
+        "albedo": best.conditions.albedo,
     }
     page_data = {"curves": _curves(lines), "colours": PALETTE, "opens": opens}
     text = json.dumps(page_data, separators=(",", ":"), allow_nan=False)
@@ -59,13 +59,13 @@ def _curves(lines: Sequence[Row]) -> list[dict[str, Any]]:
     for row in lines:
         settings = {
             "camera": row.surface.title,
-            "albedo": row.place.albedo,
-            "frames": row.place.frames,
+            "albedo": row.conditions.albedo,
+            "frames": row.conditions.frames,
         }
         curve = curves.setdefault(tuple(settings.values()), dict(settings))
         curve["error"] = _rounded(row.surface.error)
         numbers = {
-            "distance_m": row.place.distance_m,
+            "distance_m": row.conditions.distance_m,
             "a90": row.answer.a90_mm,
             "low": row.answer.low_mm,
             "high": row.answer.high_mm,
@@ -85,9 +85,9 @@ def _rounded(value: float) -> float | None:
 def save_atlas_png(path: Path, lines: Sequence[Row]) -> None:
     """Draw a90 against distance of the six cameras that find the smallest damage on the brightest
     target, with their 95 % intervals: a panel for each number of frames."""
-    albedo = max(row.place.albedo for row in lines)
-    counts = sorted({row.place.frames for row in lines})
-    drawn = [row for row in lines if row.place.albedo == albedo]
+    albedo = max(row.conditions.albedo for row in lines)
+    counts = sorted({row.conditions.frames for row in lines})
+    drawn = [row for row in lines if row.conditions.albedo == albedo]
     titles = _best_titles(drawn, counts[-1])
 
     def draw(figure: Figure) -> None:
@@ -95,9 +95,11 @@ def save_atlas_png(path: Path, lines: Sequence[Row]) -> None:
         for panel, count in zip(panels, counts, strict=True):
             for title, colour in zip(titles, COLOURS, strict=False):
                 curve = [
-                    row for row in drawn if (row.surface.title, row.place.frames) == (title, count)
+                    row
+                    for row in drawn
+                    if (row.surface.title, row.conditions.frames) == (title, count)
                 ]
-                distance_m = [row.place.distance_m for row in curve]
+                distance_m = [row.conditions.distance_m for row in curve]
                 low_mm = [row.answer.low_mm for row in curve]
                 high_mm = [row.answer.high_mm for row in curve]
                 panel.plot(
@@ -119,7 +121,7 @@ def _best_titles(rows: Sequence[Row], frames: int) -> list[str]:
     """Return the titles of the cameras with the smallest limit in the middle of all distances."""
     sizes: dict[str, list[float]] = {}
     for row in rows:
-        if row.place.frames == frames and np.isfinite(row.answer.a90_mm):
+        if row.conditions.frames == frames and np.isfinite(row.answer.a90_mm):
             sizes.setdefault(row.surface.title, []).append(row.answer.a90_mm)
     ranked = sorted(sizes, key=lambda title: float(np.median(sizes[title])))
     return ranked[: len(PALETTE)]

@@ -123,15 +123,15 @@ class Part:
         return [f"{path}={json.dumps(value)}" for path, value in settings.items()]
 
 
-def exact_overrides(camera: str, focal_px: float, kind: str, place: Conditions) -> list[str]:
+def exact_overrides(camera: str, focal_px: float, kind: str, conditions: Conditions) -> list[str]:
     """Return what `tofpod sweep atlas --set` needs to run a single set-up."""
     part = Part(
         camera=camera,
-        distance_m=place.distance_m,
-        albedos=(place.albedo,),
-        frames=(place.frames,),
-        pixel_mm=place.distance_m / focal_px / MM,
-        depths_mm={kind: (place.depth_mm,)},
+        distance_m=conditions.distance_m,
+        albedos=(conditions.albedo,),
+        frames=(conditions.frames,),
+        pixel_mm=conditions.distance_m / focal_px / MM,
+        depths_mm={kind: (conditions.depth_mm,)},
     )
     return part.overrides
 

@@ -157,7 +157,7 @@ def _row(set_up: SetUp, *, is_check: bool) -> list[Any]:
     """Return the stored values of a set-up, in the order of `COLUMNS`."""
     values: dict[str, Any] = {
         "kind": set_up.kind,
-        **vars(set_up.place),
+        **vars(set_up.conditions),
         "is_at_most": set_up.is_at_most,
         "hits": set_up.hits,
         "is_check": is_check,
@@ -181,13 +181,15 @@ def _set_up(row: Mapping[str, Any]) -> SetUp:
     numbers = {}
     for name in NUMBERS:
         numbers[name] = math.nan if row[name] is None else _above_0(name, row[name])
-    place = Conditions(
+    conditions = Conditions(
         distance_m=_above_0("distance_m", row["distance_m"]),
         albedo=_above_0("albedo", row["albedo"]),
         frames=frames,
         depth_mm=depth_mm,
     )
-    return SetUp(kind=row["kind"], place=place, is_at_most=row["is_at_most"], hits=hits, **numbers)
+    return SetUp(
+        kind=row["kind"], conditions=conditions, is_at_most=row["is_at_most"], hits=hits, **numbers
+    )
 
 
 def _above_0(name: str, value: Any) -> float:

@@ -17,11 +17,11 @@ DISTANCES = 13
 
 @dataclass(frozen=True)
 class Row:
-    """The answer of a surface at a place."""
+    """The answer of a surface at conditions."""
 
     surface: LimitSurface
     """The surface."""
-    place: Conditions
+    conditions: Conditions
     """The question's set-up."""
     answer: Answer
     """The limit there."""
@@ -31,7 +31,7 @@ class Row:
     @property
     def damage(self) -> str:
         """The kind of damage with its depth, such as ``blind hole 6 mm deep``."""
-        return damage_words(self.surface.kind, self.place.depth_mm)
+        return damage_words(self.surface.kind, self.conditions.depth_mm)
 
     @property
     def verdict(self) -> str:
@@ -69,10 +69,12 @@ ATLAS = Table(
         Column("camera", "camera", "surface.title", "title of the camera"),
         Column("camera_name", "", "surface.camera", "name of the camera in experiments"),
         Column("damage", "damage", "damage", "kind of damage, with its depth"),
-        Column("distance_m", "distance (m)", "place.distance_m", "distance of the target"),
-        Column("frames", "frames", "place.frames", "number of averaged frames"),
-        Column("albedo", "albedo", "place.albedo", "the target's albedo"),
-        Column("depth_mm", "", "place.depth_mm", "depth of the damage; empty of through-holes"),
+        Column("distance_m", "distance (m)", "conditions.distance_m", "distance of the target"),
+        Column("frames", "frames", "conditions.frames", "number of averaged frames"),
+        Column("albedo", "albedo", "conditions.albedo", "the target's albedo"),
+        Column(
+            "depth_mm", "", "conditions.depth_mm", "depth of the damage; empty of through-holes"
+        ),
         Column(
             "a90_mm",
             "a90 (mm)",
@@ -103,15 +105,15 @@ ATLAS = Table(
 
 
 def rows_at(
-    surfaces: Iterable[LimitSurface], place: Conditions, size_mm: float = np.nan
+    surfaces: Iterable[LimitSurface], conditions: Conditions, size_mm: float = np.nan
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a place, smallest limit first, and (reason, camera title) for surfaces
+    """Return the rows at conditions, smallest limit first, and (reason, camera title) for surfaces
     without an answer."""
     rows = []
     refused = []
     for surface in surfaces:
         try:
-            rows.append(Row(surface, place, surface.at(place), size_mm))
+            rows.append(Row(surface, conditions, surface.at(conditions), size_mm))
         except Outside as reason:
             refused.append((str(reason), surface.title))
     return sorted(rows, key=order), refused
@@ -123,16 +125,16 @@ def order(row: Row) -> tuple[bool, float, str]:
     return bool(np.isnan(size_mm)), float(np.nan_to_num(size_mm)), row.surface.title
 
 
-def curves(surfaces: Sequence[LimitSurface], places: Sequence[Conditions]) -> list[Row]:
-    """Return rows for every surface at `DISTANCES` distances, and at that of each place, with the
-    places' other values; none where the camera has no answer."""
+def curves(surfaces: Sequence[LimitSurface], asked: Sequence[Conditions]) -> list[Row]:
+    """Return rows for every surface at `DISTANCES` distances and at those of the conditions, with
+    the conditions' other values; none where the camera has no answer."""
     rows = []
     for surface in surfaces:
         nearest_m, farthest_m = surface.ranges["distance_m"]
         spread_m = set(np.round(np.geomspace(nearest_m, farthest_m, DISTANCES), 4))
-        for place in dict.fromkeys(places):
-            for distance_m in sorted(spread_m | {place.distance_m}):
-                beside = replace(place, distance_m=float(distance_m))
+        for conditions in dict.fromkeys(asked):
+            for distance_m in sorted(spread_m | {conditions.distance_m}):
+                beside = replace(conditions, distance_m=float(distance_m))
                 found, _ = rows_at([surface], beside)
                 rows += found
     return rows

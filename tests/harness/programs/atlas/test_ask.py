@@ -210,7 +210,7 @@ def test_an_atlas_is_read_as_it_was_written(atlas: Path):
     assert (first.camera, second.camera) == ("dim", "sharp")
     assert second.titles["twin"] == "Twin Two"
     set_up = second.set_ups[0]
-    assert set_up.place == Conditions(0.3, 0.1, 1, None) and math.isfinite(set_up.low_mm)
+    assert set_up.conditions == Conditions(0.3, 0.1, 1, None) and math.isfinite(set_up.low_mm)
 
 
 def test_an_atlas_of_other_sources_is_compared_by_its_digests(

@@ -30,10 +30,10 @@ def test_intervals_hold_the_law_between_set_ups():
     for seed in range(40):
         for kind, depth_mm in (("through", None), ("blind", 4.0)):
             fitted_law = surface(kind, seed)
-            for place in BETWEEN:
-                place = replace(place, depth_mm=depth_mm)
-                answer = fitted_law.at(place)
-                covered.append(answer.low_mm <= law_mm("sharp", place) <= answer.high_mm)
+            for conditions in BETWEEN:
+                conditions = replace(conditions, depth_mm=depth_mm)
+                answer = fitted_law.at(conditions)
+                covered.append(answer.low_mm <= law_mm("sharp", conditions) <= answer.high_mm)
                 widths.append(answer.high_mm / answer.low_mm)
     assert np.mean(covered) > 0.93 and np.median(widths) < 1.45
 
@@ -41,8 +41,8 @@ def test_intervals_hold_the_law_between_set_ups():
 @pytest.mark.parametrize("camera", ["sharp", "dim"])
 def test_the_noise_between_its_nodes(camera: str):
     table = noise_table(camera)
-    for place in (*BETWEEN, Conditions(0.3, 0.9, 50), Conditions(2.7, 0.1, 1)):
-        assert table.at(place) == pytest.approx(noise_mm(camera, place), rel=0.01)
+    for conditions in (*BETWEEN, Conditions(0.3, 0.9, 50), Conditions(2.7, 0.1, 1)):
+        assert table.at(conditions) == pytest.approx(noise_mm(camera, conditions), rel=0.01)
 
 
 def test_no_depth_is_no_answer():
@@ -56,7 +56,7 @@ def test_no_depth_is_no_answer():
 
 
 @pytest.mark.parametrize(
-    ("place", "message"),
+    ("conditions", "message"),
     [
         (Conditions(2.8, 0.3, 1), "distance 2.8 m: the atlas has 0.3 to 2.7 m"),
         (Conditions(0.29, 0.3, 1), "distance 0.29 m"),
@@ -64,11 +64,11 @@ def test_no_depth_is_no_answer():
         (Conditions(1.0, 0.05, 1), "albedo 0.05: the atlas has 0.1 to 0.9"),
     ],
 )
-def test_nothing_is_extrapolated(place: Conditions, message: str):
+def test_nothing_is_extrapolated(conditions: Conditions, message: str):
     with pytest.raises(Outside, match=message):
-        surface().at(place)
+        surface().at(conditions)
     with pytest.raises(Outside, match="depth 9 mm: the atlas has 2 to 8 mm"):
-        surface("blind").at(replace(place, distance_m=1.0, frames=1, albedo=0.3, depth_mm=9.0))
+        surface("blind").at(replace(conditions, distance_m=1.0, frames=1, albedo=0.3, depth_mm=9.0))
 
 
 def test_beyond_set_ups_without_a_limit_only_bounds_are_known():
@@ -76,9 +76,9 @@ def test_beyond_set_ups_without_a_limit_only_bounds_are_known():
     whole = surface()
     set_ups = []
     for set_up in whole.set_ups:
-        if set_up.place.distance_m == 2.7:
+        if set_up.conditions.distance_m == 2.7:
             set_up = replace(set_up, a90_mm=math.nan, hits=0, largest_mm=30.0)
-        if set_up.place.distance_m == 0.3:
+        if set_up.conditions.distance_m == 0.3:
             set_up = replace(set_up, is_at_most=True, smallest_mm=1.0)
         set_ups.append(set_up)
     cut = replace(whole, set_ups=tuple(set_ups))
