@@ -284,8 +284,8 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
         bound = f"{best.answer.low_mm:.2g} to {best.answer.high_mm:.2g} mm"
         return (
             f"At {conditions.distance_m:g} m, {best.surface.title} finds the smallest"
-            f" {DAMAGE[kind]}s{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound}) with"
-            f" {many(best.conditions.frames, 'frame')} on albedo {best.conditions.albedo:g}."
+            f" {DAMAGE[kind]}s{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound})"
+            f" with {many(best.conditions.frames, 'frame')} on albedo {best.conditions.albedo:g}."
         )
     verdicts = [row.verdict for row in rows]
     others = []
