@@ -31,6 +31,11 @@ PROGRAMS = (
         "which camera finds a damage, at which distance, with how many frames, by stored limits",
     ),
     ProgramEntry(
+        "atlas",
+        "harness.programs.atlas.atlas",
+        "computes the limits from which `ask` answers, camera by camera",
+    ),
+    ProgramEntry(
         "audit",
         "harness.programs.audit.audit",
         "how often everything that is quoted covers the truth",

@@ -185,7 +185,7 @@ def _write_tables(base: Path) -> None:
     from harness.evaluation.study.record import record_text
 
     folder = _new(base, "tables")
-    shutil.copy(ROOT / "results" / "baselines" / "atlas.parquet", folder)
+    shutil.copy(ROOT / "results" / "baselines" / "atlas.json", folder)
     shutil.copy(ROOT / "results" / "baselines" / "regression.json", folder)
     sizes = np.linspace(0.5, 12.0, 60)
     rng = np.random.default_rng(4)

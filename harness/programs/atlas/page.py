@@ -1,148 +1,127 @@
-"""The atlas of limits: a page with sliders that needs no network, and its picture."""
+"""The page of an answer of the atlas, with sliders that need no network, and its picture."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from harness.programs.atlas.tables import Row
-from harness.report.blocks import COLOURS, GREY, INK, plain_decades, save_png, template
+from harness.report.blocks import COLOURS, plain_decades, save_png, template
 from harness.vocabulary.text import many
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PALETTE = (*COLOURS, INK, GREY)
-DASHES = {"-": "", "--": "7 4", ":": "2 4"}
-"""Line styles for numbers of frames, from least to most: Matplotlib's names, and the dashes in
-SVG."""
+PALETTE = ("blue", "orange", "green", "red", "sky", "purple")
+"""The page's colours of lines, by their CSS variables; as many cameras are drawn."""
 
 
 def atlas_html(
-    rows: Sequence[Row], warnings: Sequence[str], about: Mapping[str, Any], command: str
+    lines: Sequence[Row],
+    rows: Sequence[Row],
+    answer: str,
+    *,
+    warnings: Sequence[str],
+    notes: Sequence[str],
+    command: str,
 ) -> str:
-    """Return the page, on which a user chooses damage, size, distance and frames and sees which
-    cameras find it."""
-    page_data = {
-        "curves": _curves(rows),
-        "colours": PALETTE,
-        "dashes": list(DASHES.values()),
+    """Return the page, which opens at the question. ``lines``: rows along all curves; ``rows``:
+    those of the question, the best first."""
+    best = rows[0]
+    opens = {
+        "size_mm": None if np.isnan(best.size_mm) else best.size_mm,
+        "distance_m": best.conditions.distance_m,
+        "frames": best.conditions.frames,
+        "albedo": best.conditions.albedo,
     }
+    page_data = {"curves": _curves(lines), "colours": PALETTE, "opens": opens}
     text = json.dumps(page_data, separators=(",", ":"), allow_nan=False)
-    worst = max((row.surface.error for row in rows), default=float("nan"))
     return template("atlas.html", Path(__file__).parent).render(
-        title="Which camera finds it, how far away, with how many frames?",
-        answer="",
+        title="Which camera finds it?",
+        answer=answer,
         data=Markup(text.replace("<", "\\u003c")),
         warnings=warnings,
-        error=f"{100 * worst:.0f}",
-        experiment=about.get("experiment", "a study"),
-        commit=about.get("commit", "not recorded"),
+        notes=notes,
+        damage=best.damage,
         command=command,
     )
 
 
-def _curves(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the limits against distance of each camera, damage, detector and position, with four
+def _curves(lines: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the limits against distance of each camera, albedo and number of frames, with four
     digits."""
     curves: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for row in rows:
-        settings: dict[str, Any] = {
-            "camera": row.title,
-            "damage": row.damage,
-            "detector": row.surface.detector,
+    for row in lines:
+        settings = {
+            "camera": row.surface.title,
+            "albedo": row.conditions.albedo,
+            "frames": row.conditions.frames,
         }
-        settings.update(row.position)
-        distance_m = settings.pop("distance_m")
-        curve = curves.setdefault(tuple(settings.values()), settings)
+        curve = curves.setdefault(tuple(settings.values()), dict(settings))
+        curve["error"] = _rounded(row.surface.error)
         numbers = {
-            "distance_m": distance_m,
+            "distance_m": row.conditions.distance_m,
             "a90": row.answer.a90_mm,
             "low": row.answer.low_mm,
             "high": row.answer.high_mm,
-            "largest": row.answer.largest_mm,
+            "found": row.answer.found_mm,
+            "missed": row.answer.missed_mm,
         }
         for name, value in numbers.items():
-            rounded = float(f"{value:.4g}") if np.isfinite(value) else None
-            curve.setdefault(name, []).append(rounded)
+            curve.setdefault(name, []).append(_rounded(value))
     return list(curves.values())
 
 
-def save_atlas_png(path: Path, rows: Sequence[Row]) -> None:
-    """Draw a90 against distance for each camera with the fewest and the most frames. Each damage
-    that has a limit in at least half of the places gets a panel. If there are several albedos, the
-    brightest target is drawn."""
-    albedos = sorted({row.position["albedo"] for row in rows if "albedo" in row.position})
-    rows = [row for row in rows if row.position.get("albedo") in (None, *albedos[-1:])]
-    damages = _damages_with_limits(rows)
-    titles = list(dict.fromkeys(row.title for row in rows))
-    frames = sorted({int(row.position["frames"]) for row in rows})
-    fewest_frames = frames[0]
-    most_frames = frames[-1]
-    styles = {fewest_frames: "--", most_frames: "-"}
-    detector = rows[0].surface.detector
-    columns = len(damages) if len(damages) <= 3 else 2
-    columns = max(1, columns)
-    lines = max(1, -(-len(damages) // columns))
+def _rounded(value: float) -> float | None:
+    """Return a number with four digits, or None if it is not finite."""
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def save_atlas_png(path: Path, lines: Sequence[Row]) -> None:
+    """Draw a90 against distance of the six cameras that find the smallest damage on the brightest
+    target, with their 95 % intervals: a panel for each number of frames."""
+    albedo = max(row.conditions.albedo for row in lines)
+    counts = sorted({row.conditions.frames for row in lines})
+    drawn = [row for row in lines if row.conditions.albedo == albedo]
+    titles = _best_titles(drawn, counts[-1])
 
     def draw(figure: Figure) -> None:
-        axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
-        for panel in axes.ravel()[len(damages) :]:
-            panel.set_axis_off()
-        for panel, damage in zip(axes.ravel(), damages, strict=False):
-            for count, style in styles.items():
-                for title, colour in zip(titles, PALETTE, strict=False):
-                    curve = [
-                        row
-                        for row in rows
-                        if (row.damage, row.title, row.surface.detector)
-                        == (damage, title, detector)
-                        and row.position["frames"] == count
-                    ]
-                    _draw_curve(panel, curve, style, colour, title if count == most_frames else "")
-            panel.set(title=damage, yscale="log")
-            plain_decades(panel.yaxis)
-        for panel in axes[-1]:
+        panels = figure.subplots(1, len(counts), sharex=True, sharey=True, squeeze=False)[0]
+        for panel, count in zip(panels, counts, strict=True):
+            for title, colour in zip(titles, COLOURS, strict=False):
+                curve = [
+                    row
+                    for row in drawn
+                    if (row.surface.title, row.conditions.frames) == (title, count)
+                ]
+                distance_m = [row.conditions.distance_m for row in curve]
+                low_mm = [row.answer.low_mm for row in curve]
+                high_mm = [row.answer.high_mm for row in curve]
+                panel.plot(
+                    distance_m, [row.answer.a90_mm for row in curve], color=colour, label=title
+                )
+                panel.fill_between(distance_m, low_mm, high_mm, color=colour, alpha=0.12, lw=0)
+            panel.set(title=many(count, "frame"), xscale="log", yscale="log")
             panel.set_xlabel("distance (m)")
-        for panel in axes[:, 0]:
-            panel.set_ylabel("size found 90 % of the time (mm)")
-        target = f"target of albedo {albedos[-1]:g}; " if albedos else ""
-        bands = f"bands: 95 % intervals, {many(most_frames, 'frame')}"
-        figure.suptitle(target + bands, fontsize="medium")
-        for count, style in styles.items():
-            axes[0, 0].plot([], [], style, color=GREY, label=many(count, "frame"))
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+            plain_decades(panel.xaxis)
+            plain_decades(panel.yaxis)
+        panels[0].set_ylabel("size found 90 % of the time (mm)")
+        figure.suptitle(f"{lines[0].damage}, albedo {albedo:g}", fontsize="medium")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
-    save_png(path, (3.6 * max(columns, 2), 1.7 + 3.2 * lines), draw)
+    save_png(path, (3.6 * max(len(counts), 2), 4.9), draw)
 
 
-def _damages_with_limits(rows: Sequence[Row]) -> list[str]:
-    """Return the damages that have a limit in at least half of the places."""
-    damages = [row.damage for row in rows]
-    has_limit = pd.Series([np.isfinite(row.answer.a90_mm) for row in rows], index=damages)
-    shares = has_limit.groupby(level=0, sort=False).mean()
-    return [str(damage) for damage, share in shares.items() if share >= 0.5]
-
-
-def _draw_curve(
-    panel: Axes,
-    curve: Sequence[Row],
-    style: str,
-    colour: str,
-    name: str,
-) -> None:
-    """Draw a camera's limits against distance; a curve with a name has its band."""
-    distance_m = [row.position["distance_m"] for row in curve]
-    a90_mm = [row.answer.a90_mm for row in curve]
-    panel.plot(distance_m, a90_mm, style, color=colour, label=name or None)
-    if name:
-        low_mm = [row.answer.low_mm for row in curve]
-        high_mm = [row.answer.high_mm for row in curve]
-        panel.fill_between(distance_m, low_mm, high_mm, color=colour, alpha=0.12, linewidth=0)
+def _best_titles(rows: Sequence[Row], frames: int) -> list[str]:
+    """Return the titles of the cameras with the smallest limit in the middle of all distances."""
+    sizes: dict[str, list[float]] = {}
+    for row in rows:
+        if row.conditions.frames == frames and np.isfinite(row.answer.a90_mm):
+            sizes.setdefault(row.surface.title, []).append(row.answer.a90_mm)
+    ranked = sorted(sizes, key=lambda title: float(np.median(sizes[title])))
+    return ranked[: len(PALETTE)]

@@ -1,31 +1,28 @@
-"""The table of the atlas: limits at any distance and number of frames, interpolated between
-computed set-ups."""
+"""The table of the atlas: limits at any distance, albedo and number of frames, by the law that is
+fitted between computed set-ups."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import product
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.programs.atlas.limits import Answer, LimitSurface, Outside
+from harness.programs.atlas.limits import Answer, Conditions, LimitSurface, Outside
 from harness.records.schema import Column, Estimate, Table
 
-DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent"}
-"""Names of kinds of damage in words; other kinds keep their name."""
-DISTANCES = 25
+DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent", "slot": "crack or slot"}
+"""Names of kinds of damage in words."""
+DISTANCES = 13
 """Number of distances on a curve; their logarithms are evenly spaced."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """The answer of a surface at a place."""
+    """The answer of a surface at conditions."""
 
     surface: LimitSurface
     """The surface."""
-    title: str
-    """Title of its camera."""
-    position: Mapping[str, float]
-    """A value for each axis of the surface."""
+    conditions: Conditions
+    """The question's set-up."""
     answer: Answer
     """The limit there."""
     size_mm: float = np.nan
@@ -34,9 +31,7 @@ class Row:
     @property
     def damage(self) -> str:
         """The kind of damage with its depth, such as ``blind hole 6 mm deep``."""
-        words = damage_words(self.surface.kind)
-        depth_mm = self.position.get("depth_mm")
-        return words if depth_mm is None else f"{words} {depth_mm:g} mm deep"
+        return damage_words(self.surface.kind, self.conditions.depth_mm)
 
     @property
     def verdict(self) -> str:
@@ -44,129 +39,102 @@ class Row:
         return "" if np.isnan(self.size_mm) else self.answer.verdict(self.size_mm)
 
 
-def damage_words(kind: str) -> str:
-    """Return the name of a kind of damage."""
-    return DAMAGE.get(kind, kind.replace("_", " "))
+def damage_words(kind: str, depth_mm: float | None) -> str:
+    """Return the name of a kind of damage, with its depth."""
+    words = DAMAGE.get(kind, kind)
+    return words if depth_mm is None else f"{words} {depth_mm:g} mm deep"
 
 
 def _a90(row: Row) -> Estimate:
-    """Return the limit with its interval; a little above the largest size if it lies beyond."""
+    """Return the limit with its interval, or the bound that is known instead."""
     answer = row.answer
-    a90_mm = answer.a90_mm
-    if np.isnan(a90_mm):
-        a90_mm = answer.largest_mm * 1.001
-    most_mm = np.nan_to_num(answer.largest_mm, nan=np.inf)
-    return Estimate(a90_mm, answer.low_mm, answer.high_mm, most_mm)
+    if np.isnan(answer.a90_mm) and not np.isnan(answer.missed_mm):
+        return Estimate(answer.missed_mm * 1.001, most=answer.missed_mm)
+    if np.isnan(answer.a90_mm) and not np.isnan(answer.found_mm):
+        return Estimate(answer.found_mm, at_most=True)
+    return Estimate(answer.a90_mm, answer.low_mm, answer.high_mm)
+
+
+def _error(row: Row) -> str:
+    """Return the error of the surface in percent, if the row has a limit."""
+    error = row.surface.error
+    return f"{100 * error:.0f} %" if np.isfinite(row.answer.a90_mm) else ""
 
 
 ATLAS = Table(
     "atlas",
-    "one row per camera, damage, detector, distance and number of frames: the limit that the atlas"
+    "one row per camera, damage, distance, albedo and number of frames: the limit that the atlas"
     " states",
     (
-        Column("camera", "camera", "title", "title of the camera"),
+        Column("camera", "camera", "surface.title", "title of the camera"),
         Column("camera_name", "", "surface.camera", "name of the camera in experiments"),
         Column("damage", "damage", "damage", "kind of damage, with its depth"),
-        Column("detector", "detector", "surface.detector", "name of the detector"),
+        Column("distance_m", "distance (m)", "conditions.distance_m", "distance of the target"),
+        Column("frames", "frames", "conditions.frames", "number of averaged frames"),
+        Column("albedo", "albedo", "conditions.albedo", "the target's albedo"),
         Column(
-            "distance_m",
-            "distance (m)",
-            lambda row: row.position["distance_m"],
-            "distance of the target",
-        ),
-        Column(
-            "frames",
-            "frames",
-            lambda row: int(row.position["frames"]),
-            "number of averaged frames",
-        ),
-        Column(
-            "albedo",
-            "albedo",
-            lambda row: row.position.get("albedo"),
-            "the target's albedo, if it varies",
-        ),
-        Column(
-            "depth_mm",
-            "",
-            lambda row: row.position.get("depth_mm"),
-            "depth of the damage, if it has one",
+            "depth_mm", "", "conditions.depth_mm", "depth of the damage; empty of through-holes"
         ),
         Column(
             "a90_mm",
             "a90 (mm)",
             _a90,
-            "size found 90 % of the time, with the 95 % interval of the surface; beyond the "
-            "largest"
-            " inspected size if all neighbouring set-ups miss such damage; empty if one of "
-            "them has"
-            " no limit",
+            "size found 90 % of the time (of a slot its width), with the 95 % interval of the"
+            " surface; the largest size inspected if an easier set-up misses such damage, the"
+            " smallest if a harder one finds it; empty if unknown",
             interval=True,
         ),
         Column(
-            "largest_mm",
-            "",
-            "answer.largest_mm",
-            "largest inspected size; empty if a90 is unknown",
-        ),
-        Column(
             "surface_error",
-            "",
+            "error",
             "surface.error",
             "rms error of ln a90 when each set-up is left out in turn",
+            brief=False,
         ),
+        Column("", "fit error", _error, "", text=str),
         Column(
             "found",
             "found?",
             "verdict",
-            (
-                "whether damage of the given size is found nine times out of ten: yes, no or "
-                "undecided"
-            ),
+            "whether damage of the given size is found nine times out of ten: yes, no or undecided",
         ),
     ),
     title="the atlas: size found 90 % of the time",
-    left=3,
+    left=2,
 )
 
 
 def rows_at(
-    surfaces: Iterable[LimitSurface],
-    titles: Mapping[str, str],
-    position: Mapping[str, float],
-    size_mm: float = np.nan,
+    surfaces: Iterable[LimitSurface], conditions: Conditions, size_mm: float = np.nan
 ) -> tuple[list[Row], list[tuple[str, str]]]:
-    """Return the rows at a position, smallest limit first, and (reason, camera title) for surfaces
+    """Return the rows at conditions, smallest limit first, and (reason, camera title) for surfaces
     without an answer."""
     rows = []
     refused = []
     for surface in surfaces:
-        title = titles[surface.camera]
-        on_axes = {axis: position[axis] for axis in surface.grid if axis in position}
         try:
-            rows.append(Row(surface, title, on_axes, surface.at(**on_axes), size_mm))
+            rows.append(Row(surface, conditions, surface.at(conditions), size_mm))
         except Outside as reason:
-            refused.append((str(reason), title))
-    rows.sort(key=lambda row: (np.isnan(row.answer.a90_mm), row.answer.a90_mm, row.title))
-    return rows, refused
+            refused.append((str(reason), surface.title))
+    return sorted(rows, key=order), refused
 
 
-def curves(surfaces: Sequence[LimitSurface], titles: Mapping[str, str]) -> list[Row]:
-    """Return rows for every surface at `DISTANCES` distances and each computed number of frames,
-    depth and albedo."""
+def order(row: Row) -> tuple[bool, float, str]:
+    """Return what sorts rows: known limits first, by size."""
+    size_mm = np.nan_to_num(row.answer.a90_mm, nan=row.answer.found_mm)
+    return bool(np.isnan(size_mm)), float(np.nan_to_num(size_mm)), row.surface.title
+
+
+def curves(surfaces: Sequence[LimitSurface], asked: Sequence[Conditions]) -> list[Row]:
+    """Return rows for every surface at `DISTANCES` distances and at those of the conditions, with
+    the conditions' other values; none where the camera has no answer."""
     rows = []
     for surface in surfaces:
-        title = titles[surface.camera]
-        distances_m = surface.grid["distance_m"]
-        nearest_m = distances_m[0]
-        farthest_m = distances_m[-1]
-        # rounding must not lead out of the computed range
-        spread_m = np.round(np.geomspace(nearest_m, farthest_m, DISTANCES), 4)
-        spread_m = np.clip(spread_m, nearest_m, farthest_m)
-        axes = [axis for axis in surface.grid if axis != "distance_m"]
-        for values in product(*(surface.grid[axis] for axis in axes)):
-            for distance_m in spread_m:
-                position = dict(zip(axes, values, strict=True))
-                position["distance_m"] = float(distance_m)
-                rows.append(Row(surface, title, position, surface.at(**position)))
+        nearest_m, farthest_m = surface.ranges["distance_m"]
+        spread_m = set(np.round(np.geomspace(nearest_m, farthest_m, DISTANCES), 4))
+        for conditions in dict.fromkeys(asked):
+            for distance_m in sorted(spread_m | {conditions.distance_m}):
+                beside = replace(conditions, distance_m=float(distance_m))
+                found, _ = rows_at([surface], beside)
+                rows += found
     return rows
