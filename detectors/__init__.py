@@ -6,10 +6,9 @@ Detectors are found by name: the built-in ones below, others through the entry p
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, cast
 
-from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import require_extra
 from harness.vocabulary.plug_ins import PlugIns
 
 if TYPE_CHECKING:
@@ -30,7 +29,8 @@ BUILT_IN = {
     "thesis": "detectors.methods.thesis:ThesisDetector",
 }
 
-NEEDED = {"m3c2": "py4dgeo"}  # packages of the extra `peers`, by detector
+NEEDED = {"fpfh_memory": "open3d", "m3c2": "py4dgeo", "plane_ransac": "open3d"}
+"""Packages of extras, by detector."""
 
 DETECTORS = PlugIns(GROUP, "detector", lambda: BUILT_IN)
 
@@ -48,11 +48,8 @@ def detector_type(name: str) -> Any:
 
     offer = DETECTORS.offer(name)
     package = NEEDED.get(name) if offer.built_in else None
-    if package is not None and find_spec(package) is None:
-        fix = "pip install 'tofpod[peers]'"
-        raise UserError(
-            f"detector {name!r} needs the package {package}, which is not installed: {fix}", fix=fix
-        )
+    if package is not None:
+        require_extra(package, f"detector {name!r}")
     kind = DETECTORS.load(offer)
     settings_type = getattr(kind, "settings_type", None)
     if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):

@@ -1,17 +1,19 @@
-"""Access to Open3D for files of points, odometry and volumes. Only this module imports it: that
-takes seconds."""
+"""Access to Open3D for odometry, volumes and the detectors of others. Only this module imports it:
+that takes seconds."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import load_extra
 
 DEBIAN_PACKAGES = {
     "libGL": "libgl1",
     "libgomp": "libgomp1",
     "libX11": "libx11-6",
     "libudev": "libudev1",
+    "libusb": "libusb-1.0-0",
 }
 """Debian's packages of the system libraries that Open3D's wheel expects."""
 
@@ -21,10 +23,10 @@ class MissingLibrary(UserError):
 
 
 def load_open3d() -> Any:
-    """Return the module open3d. Raises MissingLibrary with the Debian package of a missing system
-    library."""
+    """Return the module open3d. Raises UserError if it is not installed, MissingLibrary with the
+    Debian package of a missing system library."""
     try:
-        import open3d
+        open3d = load_extra("open3d", "this")
     except (ImportError, OSError) as error:
         package = next(
             (package for library, package in DEBIAN_PACKAGES.items() if library in str(error)), None

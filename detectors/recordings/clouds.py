@@ -1,11 +1,9 @@
-"""Point clouds as files: PLY and PCD by Open3D, and lists of points as text (.xyz, .txt, .csv,
-.asc, .pts).
+"""Point clouds as files: PLY, PCD, and lists of points as text (.xyz, .txt, .csv, .asc, .pts).
 
-Open3D drops the grid and fills a truncated PLY with zeros, so the header is read here: a PCD is
-organised if HEIGHT > 1, a PLY if it states num_cols and num_rows. A list has one point per line: x
-y z, then an intensity, or red green blue, or both, unless a line of names says otherwise. Its grid
-is stated by a comment or a first line of two whole numbers, or given by a lens with as many
-pixels, or by a common sensor size on which x/z and y/z rise evenly."""
+A PCD is organised if HEIGHT > 1, a PLY if it states num_cols and num_rows. A list has one point per
+line: x y z, then an intensity, or red green blue, or both, unless a line of names says otherwise.
+Its grid is stated by a comment or a first line of two whole numbers, or given by a lens with as
+many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
 import codecs
 import io
@@ -19,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detectors.open3d_library import load_open3d
 from detectors.recordings.arrays import SENSOR_SIZES
 from detectors.recordings.distances import UNITS_M, frame_of
+from detectors.recordings.lzf import unpack
 from detectors.recordings.recording import NO_GRID, CaptureOptions, Recording, read_errors
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, refuse_pixels
@@ -111,24 +109,26 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
 LEGAL_CLOUD = (
     "PLY (ASCII or binary) or PCD (ASCII, binary or compressed) with x, y, z for each point"
 )
-PLY_BYTES = {
-    "char": 1,
-    "uchar": 1,
-    "short": 2,
-    "ushort": 2,
-    "int": 4,
-    "uint": 4,
-    "float": 4,
-    "double": 8,
-    "int8": 1,
-    "uint8": 1,
-    "int16": 2,
-    "uint16": 2,
-    "int32": 4,
-    "uint32": 4,
-    "float32": 4,
-    "float64": 8,
+PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
 }
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 HEADER_BYTES = 65536
 COUNT = re.compile(r"\d{1,15}", re.ASCII)
 """A count in a header. No file has more digits, and Python refuses to read thousands of them."""
@@ -136,114 +136,207 @@ PCD_NUMBERS = 10_000  # numbers in one point; published clouds have descriptors 
 LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent at most 264
 
 
+class Header(NamedTuple):
+    """What the header of a PLY or PCD states."""
+
+    # pixels of the grid; height 1 without one
+    width: int
+    height: int
+    # bytes up to the first point
+    begin: int
+    # "ascii", "binary", or "packed": by field, compressed
+    form: str
+    # numbers of a point in the file's order, each with NumPy's name of its type and its count
+    fields: tuple[tuple[str, str, int], ...]
+
+    @property
+    def point_bytes(self) -> int:
+        """Bytes of a point without compression."""
+        return sum(np.dtype(kind).itemsize * count for _, kind, count in self.fields)
+
+    @property
+    def text_columns(self) -> int:
+        """Numbers in an ASCII line."""
+        return sum(count for _, _, count in self.fields)
+
+
 def _read_cloud(path: Path, _: Lens | None) -> Points:
     """Read one PLY or PCD. Raises UserError if it has no header or no points, or is truncated."""
-    o3d = load_open3d()
     with read_errors(f"{path}: cannot be read", LEGAL_CLOUD), path.open("rb") as file:
         content = file.read(HEADER_BYTES)
     read_header = _ply_header if path.suffix.lower() == ".ply" else _pcd_header
-    width, height, data_bytes = read_header(path, content)
-    if width * height < 1:
+    header = read_header(path, content)
+    points_stated = header.width * header.height
+    if points_stated < 1:
         raise UserError(f"{path}: holds no points", legal=LEGAL_CLOUD)
-    refuse_pixels(f"{path}: its cloud", width, height)
+    refuse_pixels(f"{path}: its cloud", header.width, header.height)
+    least_bytes = header.begin + _data_bytes(path, header)
     file_bytes = path.stat().st_size
-    if file_bytes < data_bytes:
-        problem = f"{path}: is truncated: {file_bytes} of at least {data_bytes} bytes"
+    if file_bytes < least_bytes:
+        problem = f"{path}: is truncated: {file_bytes} of at least {least_bytes} bytes"
         raise UserError(problem, legal="a whole file", fix="copy or export it again")
-    # Open3D prints warnings to the terminal; their causes are checked here and reported once
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(
-            str(path), remove_nan_points=False, remove_infinite_points=False
-        )
-    attributes = {key.lower(): cloud.point[key].numpy() for key in cloud.point}
-    points = attributes.get("positions", ())
-    if len(points) != width * height:
+    with read_errors(f"{path}: its points cannot be read", LEGAL_CLOUD):
+        columns = _columns_of(path, header)
+    points = np.stack([columns[axis] for axis in "xyz"], axis=-1)
+    if points.dtype.kind != "f":
+        points = points.astype(np.float64)
+    if len(points) != points_stated:
         problem = (
-            f"{path}: is truncated or damaged: {len(points)} of {width * height} points "
+            f"{path}: is truncated or damaged: {len(points)} of {points_stated} points "
             "could be read"
         )
         raise UserError(problem, legal=LEGAL_CLOUD, fix="copy or export it again")
-    rgb = attributes.get("colors")
-    if rgb is not None and rgb.dtype != np.uint8:  # floating-point colours run from 0 to 1
-        rgb = np.clip(np.rint(rgb * 255.0), 0, 255).astype(np.uint8)
     amplitude = None
     for key in ("amplitude", "intensities", "intensity"):
-        amplitude = attributes.get(key, amplitude)
-    grid = (height, width) if height > 1 else _grid_of(points)
-    return Points(points, grid, rgb, amplitude)
+        amplitude = columns.get(key, amplitude)
+    grid = (header.height, header.width) if header.height > 1 else _grid_of(points)
+    return Points(points, grid, _colours(columns), amplitude)
 
 
-def _ply_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return width, height (1 without a grid) and the least number of bytes of a file with this
-    header."""
+def _colours(columns: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return red, green and blue (n, 3) uint8 of a PLY's three columns or a PCD's packed one."""
+    packed = columns.get("rgb", columns.get("rgba"))
+    if packed is not None and packed.dtype.itemsize == 4:
+        # 0xRRGGBB, often declared as the floating-point number of the same bits
+        codes = np.ascontiguousarray(packed).view(np.uint32)
+        return np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)
+    if not {"red", "green", "blue"} <= set(columns):
+        return None
+    rgb = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
+    if rgb.dtype.kind == "f":  # floating-point colours run from 0 to 1
+        rgb = np.clip(np.rint(np.nan_to_num(rgb) * 255.0), 0, 255)
+    return rgb.astype(np.uint8)
+
+
+def _columns_of(path: Path, header: Header) -> dict[str, np.ndarray]:
+    """Return the single numbers of points (n,) by lower-case name, in the types that they have in
+    the file. Raises any exception if the data are damaged."""
+    points = header.width * header.height
+    singles = {
+        name.lower(): place for place, (name, _, count) in enumerate(header.fields) if count == 1
+    }
+    # names may occur twice, such as PCD's "_" for padding
+    layout = np.dtype(
+        [(f"{place}", kind, (count,)) for place, (_, kind, count) in enumerate(header.fields)]
+    )
+    with path.open("rb") as file:
+        file.seek(header.begin)
+        if header.form == "ascii":
+            text = np.loadtxt(file, comments=None, max_rows=points, ndmin=2, encoding="latin1")
+            starts = np.cumsum([0, *(count for _, _, count in header.fields)])
+            if text.shape[1] != header.text_columns:
+                raise ValueError(f"{text.shape[1]} numbers in a line, {header.text_columns} stated")
+            return {
+                name: text[:, starts[place]].astype(header.fields[place][1])
+                for name, place in singles.items()
+            }
+        if header.form == "binary":
+            rows = np.frombuffer(file.read(points * layout.itemsize), layout)
+            return {
+                name: np.ascontiguousarray(rows[f"{place}"][:, 0])
+                for name, place in singles.items()
+            }
+        packed_bytes, unpacked_bytes = struct.unpack("<II", file.read(8))
+        unpacked = unpack(file.read(packed_bytes), unpacked_bytes)
+    columns = {}
+    start = 0
+    for place, (name, kind, count) in enumerate(header.fields):
+        column = np.frombuffer(unpacked, kind, points * count, start)
+        start += column.nbytes
+        if singles.get(name.lower()) == place:
+            columns[name.lower()] = column
+    return columns
+
+
+def _ply_header(path: Path, content: bytes) -> Header:
+    """Parse the header of a PLY."""
     end = re.search(rb"end_header\r?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise UserError(f"{path}: is not a PLY file, or its header is cut off", legal=LEGAL_CLOUD)
-    lines = content[: end.start()].decode("latin1").split("\n")
+    lines = content[: end.start()].decode("latin1").splitlines()
     points = 0
-    point_bytes = 0
-    element = ""
-    names = list[str]()
+    elements = list[str]()
+    form = "ascii"
+    order = "<"
+    fields = list[tuple[str, str, int]]()
     for line in lines:
         words = line.split()
-        if words[:1] == ["element"] and len(words) == 3:
-            if words[1] == "vertex" and points:
+        if words[:1] == ["format"] and len(words) > 1 and words[1] in PLY_ORDERS:
+            form = "binary"
+            order = PLY_ORDERS[words[1]]
+        elif words[:1] == ["element"] and len(words) == 3:
+            if words[1] == "vertex" and "vertex" in elements:
                 raise UserError(f"{path}: its header states its points twice", legal=LEGAL_CLOUD)
-            element = words[1]
-            if element == "vertex" and COUNT.fullmatch(words[2]):
+            elements.append(words[1])
+            if words[1] == "vertex" and COUNT.fullmatch(words[2]):
                 points = int(words[2])
-        elif words[:1] == ["property"] and element == "vertex" and len(words) > 1:
-            names.append(words[-1])
-            point_bytes += PLY_BYTES.get(words[1], 0)
-    if points and not {"x", "y", "z"} <= set(names):
+        elif words[:1] == ["property"] and elements[-1:] == ["vertex"] and len(words) > 2:
+            kind = PLY_TYPES.get(words[1])
+            if kind is None:
+                problem = f"{path}: a number of its points is of the type {words[1][:20]!r}"
+                raise UserError(problem, legal=", ".join(PLY_TYPES))
+            fields.append((words[-1], order + kind, 1))
+    if points and not {"x", "y", "z"} <= {name.lower() for name, _, _ in fields}:
         raise UserError(f"{path}: its points lack x, y or z", legal=LEGAL_CLOUD)
-    data_bytes = points * point_bytes
-    if any(line.split()[:2] == ["format", "ascii"] for line in lines):
-        # Each number of an ASCII line takes at least a digit and a separator.
-        data_bytes = points * 2 * len(names) - 1
-    least = end.end() + data_bytes
+    if points and elements[0] != "vertex":
+        problem = f"{path}: its points follow another list, {elements[0][:20]!r}"
+        raise UserError(problem, legal="a PLY that begins with its points", fix="export it again")
     remarks = [line for line in lines if line.startswith(("obj_info", "comment"))]
     columns, rows = _stated_size(remarks)
-    if columns * rows == points and rows > 1:
-        return columns, rows, least
-    return points, 1, least
+    if columns * rows != points or rows < 2:
+        columns = points
+        rows = 1
+    return Header(columns, rows, end.end(), form, tuple(fields))
 
 
-def _pcd_header(path: Path, content: bytes) -> tuple[int, int, int]:
-    """Return the same values as `_ply_header` for a PCD."""
+def _pcd_header(path: Path, content: bytes) -> Header:
+    """Parse the header of a PCD."""
     end = re.search(rb"^DATA\s+(\w+)\s*?\r?\n", content, re.MULTILINE)
     if end is None:
         raise UserError(f"{path}: is not a PCD file, or its header is cut off", legal=LEGAL_CLOUD)
-    fields: dict[str, list[str]] = {}
+    stated: dict[str, list[str]] = {}
     for line in content[: end.start()].decode("latin1").split("\n"):
         words = line.split()
         if words and not line.startswith("#"):
-            fields[words[0]] = words[1:]
+            stated[words[0]] = words[1:]
 
     with read_errors(f"{path}: its PCD header cannot be read", LEGAL_CLOUD):
-        width = _count(fields["WIDTH"][0])
-        height = _count(fields["HEIGHT"][0])
-        points = _count(fields["POINTS"][0]) if "POINTS" in fields else width * height
-        sizes = [_count(text) for text in fields["SIZE"]]
+        width = _count(stated["WIDTH"][0])
+        height = _count(stated["HEIGHT"][0])
+        points = _count(stated["POINTS"][0]) if "POINTS" in stated else width * height
+        sizes = [_count(text) for text in stated["SIZE"]]
         counts = [1] * len(sizes)
-        if "COUNT" in fields:
-            counts = [_count(text) for text in fields["COUNT"]]
-        if not len(fields["FIELDS"]) == len(fields["TYPE"]) == len(sizes) == len(counts):
+        if "COUNT" in stated:
+            counts = [_count(text) for text in stated["COUNT"]]
+        if not len(stated["FIELDS"]) == len(stated["TYPE"]) == len(sizes) == len(counts):
             raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in length")
         if not set(sizes) <= {1, 2, 4, 8} or sum(counts) > PCD_NUMBERS:
             raise ValueError(f"sizes {sorted(set(sizes))}, {sum(counts)} numbers in a point")
         if width * height != points:
             raise ValueError(f"it states {width} x {height} but {points} points")
-    point_bytes = sum(size * times for size, times in zip(sizes, counts, strict=True))
-    unpacked = points * point_bytes
-    form = end.group(1)
-    if form == b"binary":
-        least = unpacked
-    elif form == b"ascii":
-        least = points * 2 * len(sizes) - 1
-    else:
-        least = _packed_bytes(path, end.end(), unpacked)
-    return width, height, end.end() + least
+        kinds = [
+            np.dtype(f"<{PCD_KINDS[kind]}{size}").str
+            for kind, size in zip(stated["TYPE"], sizes, strict=True)
+        ]
+        fields = tuple(zip(stated["FIELDS"], kinds, counts, strict=True))
+        if not {"x", "y", "z"} <= {name.lower() for name, _, count in fields if count == 1}:
+            raise ValueError("its points lack x, y or z")
+    form = end.group(1).decode("latin1")
+    if form not in ("ascii", "binary"):
+        form = "packed"
+    return Header(width, height, end.end(), form, fields)
+
+
+def _data_bytes(path: Path, header: Header) -> int:
+    """Return the least number of bytes of a file's points."""
+    points = header.width * header.height
+    if header.form == "ascii":
+        # each number takes at least a digit and a separator
+        return points * 2 * header.text_columns - 1
+    unpacked = points * header.point_bytes
+    if header.form == "binary":
+        return unpacked
+    return _packed_bytes(path, header.begin, unpacked)
 
 
 def _count(text: str) -> int:

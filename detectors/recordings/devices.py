@@ -439,7 +439,7 @@ def _table(path: Path) -> np.ndarray:
 
 
 def open_r3d(path: Path, options: CaptureOptions) -> Recording:
-    """Open Record3D's .r3d. Raises UserError if it is broken, or if pyliblzfse, which unpacks its
+    """Open Record3D's .r3d. Raises UserError if it is broken, or if lzfse, which unpacks its
     depth, is missing."""
     with _archive(path) as archive:
         names = archive.namelist()
@@ -515,13 +515,7 @@ def _plane(
     """Unpack an entry by Apple's LZFSE into numbers (h, w). Raises UserError unless it gives
     exactly as many."""
     packed = _content(path, archive, name)
-    try:
-        import liblzfse  # type: ignore[import-not-found]
-    except ImportError as error:
-        raise UserError(
-            f"{path}: {name}: is compressed by LZFSE, "
-            "and the package that unpacks it is not installed",
-            fix="pip install pyliblzfse, or export the capture as PLY",
-        ) from error
     with read_errors(f"{path}: {name}: is damaged, its LZFSE data cannot be unpacked", LEGAL_R3D):
-        return np.frombuffer(liblzfse.decompress(packed), kind).reshape(size[::-1])
+        import lzfse
+
+        return np.frombuffer(lzfse.decompress(packed), kind).reshape(size[::-1])

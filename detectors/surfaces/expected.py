@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from detectors.open3d_library import load_open3d
 from detectors.pixels.noise import median_of
 from detectors.rigid_motion import displacement_jacobian, kabsch, moved_by
 from detectors.surfaces.surface import (
@@ -29,6 +28,7 @@ from detectors.surfaces.surface import (
     bisquare_weights,
     fit_surface,
 )
+from detectors.surfaces.triangle_tree import TriangleTree, closest_places, first_hits, tree_of
 from harness.vocabulary.geometry import (
     MM,
     ExpectedSurface,
@@ -88,12 +88,9 @@ class Triangles:
     """(m, 3): variance of each corner along the rays; 0 for a drawing."""
 
     @cached_property
-    def scene(self) -> Any:
+    def tree(self) -> TriangleTree:
         """The triangles for rays and closest points, identified by their numbers."""
-        scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
-        faces = np.arange(3 * len(self.corners_m), dtype=np.uint32).reshape(-1, 3)
-        scene.add_triangles(self.corners_m.reshape(-1, 3).astype(np.float32), faces)
-        return scene
+        return tree_of(self.corners_m)
 
     @property
     def middle_m(self) -> np.ndarray:
@@ -193,9 +190,9 @@ def fitted(
     for step in range(3 * STEPS if known else 0, 4 * STEPS):
         by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)
-        closest = triangles.scene.compute_closest_points(moved.astype(np.float32))
-        offsets = moved - closest["points"].numpy()
-        towards = triangles.normals[closest["primitive_ids"].numpy()]
+        triangle, places = closest_places(triangles.tree, moved)
+        offsets = moved - places
+        towards = triangles.normals[triangle]
         if by_planes:
             off = np.einsum("ni,ni->n", offsets, towards)
             least_scale_m = LEAST_SCALE_M
@@ -422,17 +419,13 @@ def met(
         along = np.eye(3)[[2] * len(rays)]
     origin = transform_points(T_part_camera, starts)
     ray = rotate_vectors(T_part_camera, along)
-    scene = triangles.scene
-    hits = scene.cast_rays(np.concatenate([origin, ray], axis=1).astype(np.float32))
-    triangle = hits["primitive_ids"].numpy()
-    is_hit = triangle != scene.INVALID_ID
+    triangle, shares = first_hits(triangles.tree, origin, ray)
+    is_hit = triangle >= 0
     number = np.where(is_hit, triangle, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         normals = triangles.normals[number]
         reach = np.einsum("ni,ni->n", triangles.corners_m[number, 0] - origin, normals)
         reach /= np.einsum("ni,ni->n", ray, normals)
-    u, v = hits["primitive_uvs"].numpy().T
-    shares = np.column_stack([1.0 - u - v, u, v])
     variances_m2 = (shares * triangles.variances_m2[number]).sum(axis=1)
     z = np.where(is_hit, starts[:, 2] + reach, np.nan)
     return z, np.where(is_hit, variances_m2, np.nan)

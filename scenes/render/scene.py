@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import load_extra
 from scenes.optics import Optics
 from scenes.target.mesh import TargetPart
 
@@ -34,8 +35,7 @@ def load_mitsuba() -> Any:
     # Dr.Jit looks for LLVM when it is imported, so set the path first; it only matters without a
     # GPU.
     missing = _point_to_llvm()
-    import mitsuba as mi
-
+    mi = load_extra("mitsuba", "a render")
     if mi.variant() in VARIANTS or _works(mi, "cuda_ad_mono"):
         return mi
     if missing is not None:

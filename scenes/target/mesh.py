@@ -18,6 +18,7 @@ from scipy.ndimage import map_coordinates, zoom
 from scipy.optimize import brentq
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import load_extra
 from harness.vocabulary.files import bounded_bytes, write_bytes, write_json
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -555,8 +556,7 @@ def subtract(
     """Return body and what is added, minus cutters, by Manifold, watertight; not by trimesh's
     wrapper, which rounds to float32: 30 nm on a board of 0.6 m, 1e-3 of the facets of a 1/16 in
     hole."""
-    import manifold3d  # type: ignore[import-not-found]
-
+    manifold3d = load_extra("manifold3d", "building a target")
     longest_m = max(CELL_M, float(np.ptp(body.vertices, axis=0).max()) / MOST_ALONG)
     fine = _manifold(body.vertices, body.faces).refine_to_length(longest_m).to_mesh64()
     solids = [_manifold(fine.vert_properties[:, :3], fine.tri_verts)]
@@ -575,8 +575,7 @@ def subtract(
 def _manifold(vertices: np.ndarray, faces: np.ndarray) -> Any:
     """Return a Manifold solid. Edges between faces of different numbers stay; others within a
     plane are dissolved."""
-    import manifold3d
-
+    manifold3d = load_extra("manifold3d", "building a target")
     numbers = np.arange(len(faces), dtype=np.uint64)
     mesh = manifold3d.Mesh64(
         np.array(vertices, float, order="C"),

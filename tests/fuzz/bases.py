@@ -100,7 +100,7 @@ def _write_captures(base: Path) -> None:
 def _write_r3d(path: Path) -> None:
     """Write Record3D's archive, with a package that is an extra; without it, unpacked depth, which
     is refused, but only after the archive's description has been read."""
-    if find_spec("liblzfse") is not None:
+    if find_spec("lzfse") is not None:
         plane.write_r3d(path, FRAMES)
         return
     matrix = [2 * plane.LENS.fx, 0, 0, 0, 2 * plane.LENS.fy, 0, 94.5, 72.5, 1]

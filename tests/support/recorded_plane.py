@@ -147,7 +147,7 @@ def write_stray(folder: Path, frames: int, step_m: float = 0.0) -> Path:
 
 def write_r3d(path: Path, frames: int, step_m: float = 0.0) -> Path:
     """Record3D's archive, its depth packed by the LZFSE package."""
-    import liblzfse
+    import lzfse
 
     k = [2 * LENS.fx, 0, 0, 0, 2 * LENS.fy, 0, 2 * LENS.cx + 0.5, 2 * LENS.cy + 0.5, 1]
     poses = [[0, 0, 0, 1, i * step_m, 0, 0] for i in range(frames)]
@@ -156,9 +156,9 @@ def write_r3d(path: Path, frames: int, step_m: float = 0.0) -> Path:
         archive.writestr("metadata", json.dumps({"K": k, **size, "fps": 30, "poses": poses}))
         for i in range(frames):
             depth = np.where(depth_mm(i) == 0, np.nan, depth_mm(i) / 1e3).astype("<f4")
-            archive.writestr(f"rgbd/{i}.depth", liblzfse.compress(depth.tobytes()))
+            archive.writestr(f"rgbd/{i}.depth", lzfse.compress(depth.tobytes()))
             sure = np.full(depth.shape, 2, np.uint8)
-            archive.writestr(f"rgbd/{i}.conf", liblzfse.compress(sure.tobytes()))
+            archive.writestr(f"rgbd/{i}.conf", lzfse.compress(sure.tobytes()))
     return path
 
 

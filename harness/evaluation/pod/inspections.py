@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import load_extra
 from harness.vocabulary.files import TABLE_BYTES, bounded_bytes, limited_memory
 
 # rows for two parameters and a bound; MIL-HDBK-1823A asks for 60 targets (hit/miss) or 40 (signal)
@@ -421,13 +422,7 @@ def _separator(header: str) -> str:
 def _sheet_rows(path: Path, content: bytes) -> Rows:
     """Return the rows of an Excel file's only sheet with content. Raises UserError if openpyxl is
     missing."""
-    try:
-        import openpyxl
-    except ImportError as error:
-        fix = "pip install openpyxl, or save the sheet as CSV"
-        raise UserError(
-            f"{path}: reading an Excel file needs the package openpyxl", fix=fix
-        ) from error
+    openpyxl = load_extra("openpyxl", f"{path}: reading an Excel file")
     try:
         with limited_memory():
             book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)

@@ -30,6 +30,7 @@ from typing import Any
 from harness.runs.jobs import Code, Ended, Job, Limits, Stage
 from harness.runs.processes import MOST_RENDERERS, Answers, LocalEngine
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.extras import load_extra, require_extra
 from harness.vocabulary.files import write_text
 from harness.vocabulary.provenance import source_digest
 
@@ -422,13 +423,9 @@ def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
         raise UserError(
             f"--scheduler {scheduler}: is neither an address nor a kind of job queue", legal=legal
         )
-    try:
-        import dask
-        import distributed
-    except ImportError as error:
-        raise UserError(
-            "--scheduler needs dask.distributed", fix='pip install "tofpod[cluster]"'
-        ) from error
+    distributed = load_extra("distributed", "--scheduler")
+    import dask
+
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": f"{ANSWERS_S}s"}))
         # the ends of jobs show which workers come and go, and this module checks versions
@@ -439,14 +436,11 @@ def _connected(scheduler: str, workers_wanted: int) -> Iterator[Any]:
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         cluster = None
         if not is_address:  # according to the user's own dask configuration
+            require_extra("dask_jobqueue", "jobqueue:")
             try:
                 cluster = getattr(importlib.import_module(f"dask_jobqueue.{kind}"), KINDS[kind])()
                 stack.callback(_close, cluster)
                 cluster.scale(jobs=workers_wanted)
-            except ImportError as error:
-                raise UserError(
-                    "jobqueue: needs dask-jobqueue", fix='pip install "tofpod[cluster]"'
-                ) from error
             except (ValueError, TypeError, OSError, RuntimeError) as error:
                 message = f"dask-jobqueue could not start a cluster of kind {kind}: {error}"
                 fix = (

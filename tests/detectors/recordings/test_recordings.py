@@ -663,7 +663,7 @@ def test_pixels_of_low_confidence_are_no_return_and_motion_is_warned_of(tmp_path
 
 
 def test_record3d_keeps_its_depth_compressed(tmp_path: Path) -> None:
-    pytest.importorskip("liblzfse")
+    pytest.importorskip("lzfse")
     recording = open_capture([plane.write_r3d(tmp_path / "a.r3d", 2)])
     frame = next(recording.frames())
     np.testing.assert_allclose(points_of(recording, frame), TRUE_M, atol=1e-6)

@@ -1,0 +1,294 @@
+"""A tree of boxes over triangles: the first triangle that a ray meets, and the closest point.
+
+The triangles are sorted along a Morton curve of their middles (Lauterbach et al. 2009), two to a
+leaf; node i of a complete binary tree has the children 2 i and 2 i + 1, and the root is node 1."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+LEAF = 2  # triangles of a leaf
+CURVE_BITS = 20  # of a triangle's place on the curve, along one axis
+MOST_WAITING = 64  # nodes that wait while one is visited: one for each level
+# a ray that passes between two triangles by rounding meets both; a share of a triangle's side
+ON_EDGE = 1e-12
+PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
+
+
+class TriangleTree(NamedTuple):
+    """Triangles and the boxes around them."""
+
+    # (m, 3, 3): the corners of each triangle, in the order of the curve
+    corners: np.ndarray
+    # (m,): the number of each of them in the list that the tree is made of
+    numbers: np.ndarray
+    # (2 leaves, 3): the lowest corner of each node's box; infinite if it holds no triangle
+    lows: np.ndarray
+    # (2 leaves, 3): the highest corner; minus infinite if it holds no triangle
+    highs: np.ndarray
+
+
+def tree_of(corners: np.ndarray) -> TriangleTree:
+    """Return the tree of triangles (m, 3, 3), which must be finite and at least one."""
+    order = np.argsort(_along_curve(corners.mean(axis=1)), kind="stable")
+    ordered = np.ascontiguousarray(corners[order], dtype=np.float64)
+    leaves = 1
+    while leaves * LEAF < len(ordered):
+        leaves *= 2
+    lows = np.full((2 * leaves, 3), np.inf)
+    highs = np.full((2 * leaves, 3), -np.inf)
+    starts = np.arange(0, len(ordered), LEAF)
+    filled = slice(leaves, leaves + len(starts))
+    lows[filled] = np.minimum.reduceat(ordered.min(axis=1), starts)
+    highs[filled] = np.maximum.reduceat(ordered.max(axis=1), starts)
+    first = leaves
+    while first > 1:
+        pairs = slice(first, 2 * first)
+        first //= 2
+        lows[first : 2 * first] = lows[pairs].reshape(-1, 2, 3).min(axis=1)
+        highs[first : 2 * first] = highs[pairs].reshape(-1, 2, 3).max(axis=1)
+    return TriangleTree(ordered, order, lows, highs)
+
+
+def _along_curve(places: np.ndarray) -> np.ndarray:
+    """Return the number of each place (n, 3) on a Morton curve: the bits of its cell, by turns."""
+    low = places.min(axis=0)
+    side = max(float((places.max(axis=0) - low).max()), np.finfo(float).tiny)
+    cells = ((places - low) / side * (2**CURVE_BITS - 1)).astype(np.int64)
+    along = np.zeros(len(places), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            along |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return along
+
+
+def first_hits(
+    tree: TriangleTree, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number (n,) of the first triangle that each ray meets from either side, -1 for
+    none, and the shares (n, 3) of its corners in the place. Of triangles at the same distance, the
+    first in the list counts. Rays: from (n, 3) along (n, 3), of any length."""
+    starts = np.ascontiguousarray(origins, float)
+    along = np.ascontiguousarray(directions, float)
+    return _first_hits(*tree, starts, along)
+
+
+def closest_places(tree: TriangleTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number (n,) of the triangle closest to each point (n, 3), and the place (n, 3) on
+    it. At the same distance, the first in the list counts. The points must be finite."""
+    return _closest_places(*tree, np.ascontiguousarray(points, float))
+
+
+@numba.njit(**PLAIN)
+def _first_hits(
+    corners: np.ndarray,
+    numbers: np.ndarray,
+    lows: np.ndarray,
+    highs: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    first = np.full(len(origins), -1, np.int64)
+    shares = np.zeros((len(origins), 3))
+    leaves = len(lows) // 2
+    waiting = np.empty(MOST_WAITING, np.int64)
+    reciprocal = np.empty(3)
+    for i in range(len(origins)):
+        origin = origins[i]
+        direction = directions[i]
+        for axis in range(3):
+            # 0 for a ray across the axis
+            reciprocal[axis] = 0.0
+            if direction[axis] != 0.0:
+                reciprocal[axis] = 1.0 / direction[axis]
+        nearest = np.inf
+        # a ray that is not a number enters no box
+        waiting[0] = 1
+        size = 1 if _entry(lows[1], highs[1], origin, reciprocal) < np.inf else 0
+        while size > 0:
+            size -= 1
+            node = waiting[size]
+            if node >= leaves:
+                begin = (node - leaves) * LEAF
+                for j in range(begin, min(begin + LEAF, len(corners))):
+                    distance, u, v = _met(corners[j], origin, direction)
+                    is_first = distance == nearest and numbers[j] < first[i]
+                    if distance < nearest or (is_first and distance < np.inf):
+                        nearest = distance
+                        first[i] = numbers[j]
+                        shares[i, 0] = 1.0 - u - v
+                        shares[i, 1] = u
+                        shares[i, 2] = v
+                continue
+            near = 2 * node
+            far = near + 1
+            near_entry = _entry(lows[near], highs[near], origin, reciprocal)
+            far_entry = _entry(lows[far], highs[far], origin, reciprocal)
+            if far_entry < near_entry:
+                near, far = far, near
+                near_entry, far_entry = far_entry, near_entry
+            if far_entry < np.inf and far_entry <= nearest:
+                waiting[size] = far
+                size += 1
+            if near_entry < np.inf and near_entry <= nearest:
+                waiting[size] = near
+                size += 1
+    return first, shares
+
+
+@numba.njit(inline="always", **PLAIN)
+def _entry(low: np.ndarray, high: np.ndarray, origin: np.ndarray, reciprocal: np.ndarray) -> float:
+    """Return where a ray enters a box, at least 0; infinite if it does not."""
+    entry = 0.0
+    leave = np.inf
+    for axis in range(3):
+        first = low[axis]
+        last = high[axis]
+        if reciprocal[axis] == 0.0:
+            if origin[axis] < first or origin[axis] > last:
+                return np.inf
+            continue
+        if reciprocal[axis] < 0.0:
+            first = high[axis]
+            last = low[axis]
+        entry = max(entry, (first - origin[axis]) * reciprocal[axis])
+        leave = min(leave, (last - origin[axis]) * reciprocal[axis])
+    # a flat box is entered where it is left, but for rounding
+    return entry if entry <= leave * (1.0 + 4e-16) else np.inf
+
+
+@numba.njit(inline="always", **PLAIN)
+def _met(
+    corners: np.ndarray, origin: np.ndarray, direction: np.ndarray
+) -> tuple[float, float, float]:
+    """Return where a ray meets a triangle, in lengths of its direction, infinite if it does not,
+    and the shares of the second and third corner (Moeller and Trumbore 1997)."""
+    second = corners[1] - corners[0]
+    third = corners[2] - corners[0]
+    start = origin - corners[0]
+    px = direction[1] * third[2] - direction[2] * third[1]
+    py = direction[2] * third[0] - direction[0] * third[2]
+    pz = direction[0] * third[1] - direction[1] * third[0]
+    volume = second[0] * px + second[1] * py + second[2] * pz
+    if volume == 0.0:
+        return np.inf, 0.0, 0.0
+    u = (start[0] * px + start[1] * py + start[2] * pz) / volume
+    qx = start[1] * second[2] - start[2] * second[1]
+    qy = start[2] * second[0] - start[0] * second[2]
+    qz = start[0] * second[1] - start[1] * second[0]
+    v = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / volume
+    distance = (third[0] * qx + third[1] * qy + third[2] * qz) / volume
+    is_inside = u >= -ON_EDGE and v >= -ON_EDGE and u + v <= 1.0 + ON_EDGE
+    if is_inside and distance >= 0.0:
+        return distance, u, v
+    return np.inf, 0.0, 0.0
+
+
+@numba.njit(**PLAIN)
+def _closest_places(
+    corners: np.ndarray,
+    numbers: np.ndarray,
+    lows: np.ndarray,
+    highs: np.ndarray,
+    points: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    closest = np.full(len(points), -1, np.int64)
+    places = np.zeros((len(points), 3))
+    leaves = len(lows) // 2
+    waiting = np.empty(MOST_WAITING, np.int64)
+    for i in range(len(points)):
+        point = points[i]
+        nearest = np.inf
+        if i > 0:
+            # the place closest to the point before it bounds the search, but may not be the first
+            nearest = (1.0 + 1e-12) * _square_off(places[i - 1], places[i - 1], point)
+        waiting[0] = 1
+        size = 1
+        while size > 0:
+            size -= 1
+            node = waiting[size]
+            if _square_off(lows[node], highs[node], point) > nearest:
+                continue
+            if node >= leaves:
+                begin = (node - leaves) * LEAF
+                for j in range(begin, min(begin + LEAF, len(corners))):
+                    x, y, z = _closest(corners[j], point)
+                    square = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
+                    is_first = square == nearest and numbers[j] < closest[i]
+                    if square < nearest or is_first:
+                        nearest = square
+                        closest[i] = numbers[j]
+                        places[i, 0] = x
+                        places[i, 1] = y
+                        places[i, 2] = z
+                continue
+            near = 2 * node
+            far = near + 1
+            near_square = _square_off(lows[near], highs[near], point)
+            far_square = _square_off(lows[far], highs[far], point)
+            if far_square < near_square:
+                near, far = far, near
+            waiting[size] = far
+            waiting[size + 1] = near
+            size += 2
+    return closest, places
+
+
+@numba.njit(inline="always", **PLAIN)
+def _square_off(low: np.ndarray, high: np.ndarray, point: np.ndarray) -> float:
+    """Return the square of a point's distance from a box."""
+    square = 0.0
+    for axis in range(3):
+        off = max(low[axis] - point[axis], point[axis] - high[axis], 0.0)
+        square += off * off
+    return square
+
+
+@numba.njit(inline="always", **PLAIN)
+def _closest(corners: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+    """Return the place on a triangle that is closest to a point (Ericson 2005, 5.1.5)."""
+    first = corners[0]
+    second_side = corners[1] - first
+    third_side = corners[2] - first
+    d1 = _dot(second_side, point - first)
+    d2 = _dot(third_side, point - first)
+    d3 = _dot(second_side, point - corners[1])
+    d4 = _dot(third_side, point - corners[1])
+    d5 = _dot(second_side, point - corners[2])
+    d6 = _dot(third_side, point - corners[2])
+    # twice the areas that the point makes with each side, of the sign of the triangle's own
+    opposite_third = d1 * d4 - d3 * d2
+    opposite_second = d5 * d2 - d1 * d6
+    opposite_first = d3 * d6 - d5 * d4
+    u = 0.0
+    v = 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        pass
+    elif d3 >= 0.0 and d4 <= d3:
+        u = 1.0
+    elif d6 >= 0.0 and d5 <= d6:
+        v = 1.0
+    elif opposite_third <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        u = d1 / (d1 - d3)
+    elif opposite_second <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        v = d2 / (d2 - d6)
+    elif opposite_first <= 0.0 and d4 >= d3 and d5 >= d6:
+        v = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        u = 1.0 - v
+    else:
+        area = opposite_first + opposite_second + opposite_third
+        u = opposite_second / area
+        v = opposite_third / area
+    x = first[0] + u * second_side[0] + v * third_side[0]
+    y = first[1] + u * second_side[1] + v * third_side[1]
+    z = first[2] + u * second_side[2] + v * third_side[2]
+    return x, y, z
+
+
+@numba.njit(inline="always", **PLAIN)
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the scalar product of two vectors (3,)."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -1,0 +1,81 @@
+"""Rays and closest points of the tree, beside all triangles tried one by one in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from detectors.surfaces.triangle_tree import LEAF, closest_places, first_hits, tree_of
+
+DRAWS = np.random.default_rng(44)
+SCATTERED = DRAWS.uniform(-1.0, 1.0, (83, 1, 3)) + DRAWS.normal(0.0, 0.2, (83, 3, 3))
+
+
+def distances_along(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return where a ray meets each triangle (m, 3, 3): origin + t direction = a + u b + v c."""
+    sides = corners[:, 1:] - corners[:, :1]
+    matrix = np.stack(
+        [np.broadcast_to(-direction, (len(corners), 3)), *sides.transpose(1, 0, 2)], 2
+    )
+    t, u, v = np.linalg.solve(matrix, (origin - corners[:, 0])[..., None])[..., 0].T
+    return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0), t, np.inf)
+
+
+def sampled_distance(corners: np.ndarray, point: np.ndarray) -> float:
+    """Return the least distance of a point from samples of a triangle (3, 3), 1 % of a side apart."""
+    u, v = np.meshgrid(np.linspace(0, 1, 101), np.linspace(0, 1, 101))
+    inside = u + v <= 1.0 + 1e-9
+    shares = np.column_stack([1.0 - u[inside] - v[inside], u[inside], v[inside]])
+    return float(np.linalg.norm(shares @ corners - point, axis=1).min())
+
+
+def test_rays_meet_the_triangle_that_is_first_of_all() -> None:
+    origins = DRAWS.uniform(-1.5, 1.5, (300, 3))
+    directions = DRAWS.uniform(-0.7, 0.7, (300, 3)) - origins
+    directions[:30, 0] = 0.0
+    number, shares = first_hits(tree_of(SCATTERED), origins, directions)
+    for i in range(300):
+        distances = distances_along(SCATTERED, origins[i], directions[i])
+        if np.isinf(distances.min()):
+            assert number[i] == -1
+            continue
+        assert number[i] == distances.argmin()
+        place = origins[i] + distances.min() * directions[i]
+        np.testing.assert_allclose(shares[i] @ SCATTERED[number[i]], place, atol=1e-9)
+    assert 60 < (number >= 0).sum() < 290
+
+
+def test_the_closest_place_is_on_the_closest_triangle() -> None:
+    points = DRAWS.uniform(-2.0, 2.0, (60, 3))
+    number, places = closest_places(tree_of(SCATTERED), points)
+    for i in range(60):
+        sampled = [sampled_distance(corners, points[i]) for corners in SCATTERED]
+        off = np.linalg.norm(places[i] - points[i])
+        assert min(sampled) - 0.01 < off <= min(sampled) + 1e-12
+        assert sampled[number[i]] < min(sampled) + 0.01
+        assert sampled_distance(SCATTERED[number[i]], places[i]) < 0.02
+
+
+def test_equal_distances_and_flat_boxes() -> None:
+    """A flat square of two triangles, twice: boxes without depth, and ties on all of it."""
+    square = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[1, 1, 1], [0, 1, 1], [1, 0, 1]]], float)
+    tree = tree_of(np.concatenate([square, square]))
+    x, y = (places.ravel() for places in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
+    starts = np.column_stack([x, y, np.zeros(81)])
+    number, _ = first_hits(tree, starts, np.tile([0.0, 0.0, 2.0], (81, 1)))
+    np.testing.assert_array_equal(number, np.where(x + y <= 1.0, 0, 1))
+    below, places = closest_places(tree, starts)
+    np.testing.assert_array_equal(below, np.where(x + y <= 1.0, 0, 1))
+    np.testing.assert_allclose(places, starts + np.array([0.0, 0.0, 1.0]), atol=1e-15)
+    away, _ = first_hits(tree, starts, np.tile([0.0, 0.0, -2.0], (81, 1)))
+    assert (away == -1).all()
+    nowhere, _ = first_hits(tree, np.full((2, 3), np.nan), starts[:2])
+    assert (nowhere == -1).all()
+
+
+def test_every_triangle_of_any_number_is_in_the_tree() -> None:
+    for count in (1, LEAF, LEAF + 1, 37):
+        corners = SCATTERED[:count]
+        number, _ = closest_places(tree_of(corners), corners.mean(axis=1))
+        assert set(number.tolist()) <= set(range(count))
+        assert number[0] == 0 or count > 1
+        np.testing.assert_array_equal(np.sort(tree_of(corners).numbers), np.arange(count))
