@@ -88,6 +88,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "--albedo",
         type=float,
+        metavar="A",
         default=0.6,
         help="albedo of part and backing at this wavelength (default: 0.6)",
     )
@@ -133,6 +134,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--detector",
+        metavar="NAME",
         default=cli.CANDIDATES[0],
         help=f"detector's name (default: {cli.CANDIDATES[0]})",
     )
