@@ -254,7 +254,10 @@ def test_the_program_states_a_limit_of_a_recording(
 
     assert implant.main([*arguments, "--depths", "2:4", "--out", str(tmp_path / "no")]) == 2
     assert "depth_mm" in capsys.readouterr().err
-    for name in ("--targets", "--hit-radius", "--frames"):
+    with pytest.raises(SystemExit, match="2"):
+        implant.main([*arguments, "--hit-radius", "0"])
+    assert "--hit-radius: '0' is not a length" in capsys.readouterr().err
+    for name in ("--targets", "--frames"):
         assert implant.main([*arguments, name, "0", "--out", str(tmp_path / "no")]) == 2
         assert f"{name} 0" in capsys.readouterr().err
     arguments[arguments.index("2:14")] = "60:80"
