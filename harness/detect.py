@@ -36,6 +36,7 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add("--target", type=whole_number(10**9), metavar="N", help=target)
     add(
         "--detector",
+        metavar="NAME",
         default=cli.DEFAULT_DETECTOR,
         help=(
             f"name of the detector; {cli.DEFAULT_DETECTOR} (default): of "

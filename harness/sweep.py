@@ -19,7 +19,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be "
         "repeated"
     )
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=help)
     help = (
         "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit "
         "is simulated"

@@ -222,6 +222,19 @@ def span(unit: str) -> Callable[[str], tuple[float, float]]:
     return parsed
 
 
+BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
+"""Units of sizes in memory: powers of ten, as disks are sold."""
+
+
+def bytes_of(text: str) -> int:
+    """Return a number of bytes from ``5GB`` or ``500 MB``, for argparse; a bare number is in GB."""
+    match = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})?", text.strip())
+    factors = {unit.lower(): factor for unit, factor in BYTES.items()}
+    if match is None or (match[2] or "GB").lower() not in factors:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size, such as 500MB, 5GB or 1.5TB")
+    return round(float(match[1]) * factors[(match[2] or "GB").lower()])
+
+
 def length_m(option: str, text: str) -> float:
     """Convert a length that must state its unit to metres. Raises UserError that names the
     option."""

@@ -39,7 +39,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a YAML file, or the name of one that comes with tofpod: a study of drawn damage",
     )
     change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add("--detector", metavar="NAME", help="the only detector, of an experiment that compares some")
     pose = (
         "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; "

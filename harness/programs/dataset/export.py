@@ -25,7 +25,7 @@ REPEAT = 0
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
+    add("experiment", type=Path, help="an experiment's file or name")
     add(
         "--format",
         required=True,
@@ -34,7 +34,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("--out", required=True, type=Path, metavar="DIR", help="a new or empty folder")
     change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--views",
         type=whole_number(10_000),

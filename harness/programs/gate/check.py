@@ -46,7 +46,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     change = (
         "change a value of the file, such as seed=7 for another draw of the noise; may be repeated"
     )
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--baseline",
         type=Path,

@@ -88,6 +88,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "--albedo",
         type=float,
+        metavar="A",
         default=0.6,
         help="albedo of part and backing at this wavelength (default: 0.6)",
     )
@@ -133,6 +134,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--detector",
+        metavar="NAME",
         default=cli.CANDIDATES[0],
         help=f"detector's name (default: {cli.CANDIDATES[0]})",
     )
@@ -178,6 +180,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     # options of tofpod detect that this program lacks
     options.quiet_capture = None
     options.target = None
+    options.damage = damage_kind("--damage", options.damage, DAMAGES)
     refuse_thresholds(options)
     _refuse_numbers(options)
     detector, settings = cli.detector_of(options, options.crop, options.set)
@@ -345,9 +348,8 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
     widest_mm = math.hypot(options.diameters[1], length_mm)
     apart_mm = options.apart or max(2 * options.hit_radius, widest_mm) + ROOM_MM
     room = FILLED * min(scan.area_m2 for scan in scans) / (math.pi / 4 * (apart_mm * MM) ** 2)
-    kind = damage_kind("--damage", options.damage, DAMAGES)
-    damage = {"kind": kind, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
-    size_name = "width_mm" if kind == "slot" else "diameter_mm"
+    damage = {"kind": options.damage, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
+    size_name = "width_mm" if options.damage == "slot" else "diameter_mm"
     damage[size_name] = list(options.diameters)
     if options.depths:
         damage["depth_mm"] = list(options.depths)

@@ -78,7 +78,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
     add(
-        "--board",
+        "--board-size",
         default="270x175",
         metavar="WxH",
         help="size of a board, mm (default: 270x175, one sheet of A4)",
@@ -227,12 +227,12 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     from harness.vocabulary.seeds import random_stream
 
     try:
-        width, height = map(float, options.board.lower().split("x"))
+        width, height = map(float, options.board_size.lower().split("x"))
         if not all(0 < length_mm < LARGEST_MM for length_mm in (width, height)):
             raise ValueError("no size of a board")
     except ValueError as error:
         raise UserError(
-            f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
+            f"--board-size {options.board_size}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
         ) from error
     side = MARK_MM
     spacing = options.apart
@@ -258,7 +258,7 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
                 free_mm.append((x, y))
     count = -(-len(sizes) // max(len(free_mm), 1))
     if not free_mm or min(inset.min(), room.min()) <= side or 4 * count > CODES:
-        fix = "a larger --board, a smaller --apart, or fewer --targets"
+        fix = "a larger --board-size, a smaller --apart, or fewer --targets"
         raise UserError(
             f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix
         )

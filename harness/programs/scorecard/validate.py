@@ -107,10 +107,11 @@ def main(options: argparse.Namespace, command: str) -> int:
             opened(options.capture, options.intrinsics, **reading) if options.capture else None
         )
         return run_board(options, recording, command)
-    for name in (*READING, "intrinsics", "frames", "mask"):
+    for name in (*READING, "intrinsics", "max_frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(
-                f"--{name} belongs to a capture, but none is named", fix="add --capture PATH"
+                f"--{name.replace('_', '-')} belongs to a capture, but none is named",
+                fix="add --capture PATH",
             )
     from harness.programs.scorecard.program import run_scorecard
 

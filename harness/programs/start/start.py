@@ -15,7 +15,7 @@ from harness.vocabulary.program import length_m, program
 if TYPE_CHECKING:
     from harness.programs.start.plan import Inquiry
 
-NEEDED = ("camera", "part", "damage", "tolerance")
+NEEDED = ("camera", "part", "damage", "size")
 """Options without a default: if one is missing, all that are missing are asked for."""
 NONE = "none"
 DEFAULT_DISTANCE = "0.7m"
@@ -30,9 +30,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--recording", metavar="PATH", help=recording)
     add("--part", metavar="PART", help="board, sheet, pipe or wall")
     add("--damage", metavar="KIND", help="hole, blind-hole, dent, crack, scratch, bump, ...")
-    tolerance = "the size that must be found, such as 5mm: a diameter, a crack's width"
-    add("--tolerance", metavar="LENGTH", help=tolerance)
-    add("--depth", metavar="LENGTH", help="its depth (default: a quarter of the tolerance)")
+    size = "the tolerance, which must be found, such as 5mm: a diameter, a crack's width"
+    add("--size", metavar="LENGTH", help=size)
+    add("--depth", metavar="LENGTH", help="its depth (default: a quarter of the size)")
     distance = f"distance from camera to part (default: {DEFAULT_DISTANCE})"
     add("--distance", metavar="LENGTH", help=distance)
     add("--out", metavar="FILE.yaml", help="the experiment's file (default: named after the part)")
@@ -43,8 +43,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Ask for camera or recording, part, damage and tolerance in plain questions, write an "
     "experiment that tells whether such damage is found, and print three commands to run. "
     "What options state is not asked for.",
-    "tofpod start --camera azure_kinect_nfov --part board --damage hole --tolerance 5mm",
-    "tofpod start --camera kinect_v2 --part pipe --damage scratch --tolerance 40mm --depth 2mm",
+    "tofpod start --camera azure_kinect_nfov --part board --damage hole --size 5mm",
+    "tofpod start --camera kinect_v2 --part pipe --damage scratch --size 40mm --depth 2mm",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake or an input that ends, 130 after
@@ -79,9 +79,9 @@ def _inquiry(options: argparse.Namespace, *, asks: bool) -> Inquiry:
         lambda words: damage_kind("--damage", words, KINDS),
     )
     tolerance = Question(
-        "--tolerance",
+        "--size",
         "Which size must be found? (the diameter, a crack's width, a scratch's length; 5mm)",
-        lambda words: length_m("--tolerance", words) / MM,
+        lambda words: length_m("--size", words) / MM,
     )
     distance = Question(
         "--distance",
@@ -93,7 +93,7 @@ def _inquiry(options: argparse.Namespace, *, asks: bool) -> Inquiry:
     chosen_recording = recording.answered(options.recording, asks=asks)
     chosen_part = part.answered(options.part, asks=asks)
     kind = damage.answered(options.damage, asks=asks)
-    tolerance_mm = tolerance.answered(options.tolerance, asks=asks)
+    tolerance_mm = tolerance.answered(options.size, asks=asks)
     depth_mm = None
     if kind != "through":
         depth = Question(

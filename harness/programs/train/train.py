@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "detector with a network",
     )
     change = "change a value of the file, such as study.boards=20; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add("--out", type=Path, required=True, metavar="FILE", help="the network's file, .npz")
     passes = "how often each picture is shown (default: 6)"
     add("--passes", type=whole_number(MOST_PASSES), default=6, metavar="N", help=passes)

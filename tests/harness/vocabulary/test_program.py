@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from harness.vocabulary.program import Program
+from harness.vocabulary.program import Program, bytes_of
 
 THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -84,3 +84,17 @@ def test_a_mistyped_further_program_is_not_taken_for_arguments(capsys) -> None:
     with pytest.raises(SystemExit, match="2"):
         gauge(["raed"])
     assert "raed: there is no such argument; did you mean read?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("5GB", 5_000_000_000), ("5", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0)],
+)
+def test_sizes_in_memory(text: str, count: int) -> None:
+    assert bytes_of(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-5GB", "5 gigs", "1e3GB", "nan", "5GBx", "５GB"])
+def test_what_is_no_size(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="not a size"):
+        bytes_of(text)

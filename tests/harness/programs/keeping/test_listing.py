@@ -15,12 +15,10 @@ import pytest
 
 from detectors import detector_type
 from harness.programs.keeping import clean, ls
-from harness.programs.keeping.listing import bytes_of
 from harness.runs.jobs import Ended
 from harness.runs.journal import Journal
 from harness.runs.results_folder import latest_run, point_to
 from harness.runs.shards import locked
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
@@ -292,8 +290,8 @@ def left_in(folder: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("arguments", "kept"),
     [
-        (["--limit", "0MB"], ""),
-        (["--limit", "1GB"], "abc"),
+        (["--cache-limit", "0MB"], ""),
+        (["--cache-limit", "1GB"], "abc"),
         (["--all"], ""),
         (["--all", "--dry-run"], "abc"),
     ],
@@ -415,7 +413,7 @@ def test_names_that_name_no_results(tmp_path, capsys, name):
     "arguments",
     [
         ["results", "study", "--all"],
-        ["results", "study", "--limit", "1GB"],
+        ["results", "study", "--cache-limit", "1GB"],
         ["cache", "study", "--all"],
     ],
 )
@@ -438,20 +436,6 @@ def test_results_that_are_links_are_refused(tmp_path, capsys):
 
 
 # ---------------------------------------------------------------- words
-
-
-@pytest.mark.parametrize(
-    ("text", "count"),
-    [("5GB", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0), ("2TB", 2 * 10**12)],
-)
-def test_sizes(text, count):
-    assert bytes_of(text) == count
-
-
-@pytest.mark.parametrize("text", ["", "5", "GB", "-5GB", "5 gigs", "1e3GB", "nan", "5GBx", "５GB"])
-def test_what_is_no_size(text):
-    with pytest.raises(UserError, match="not a size"):
-        bytes_of(text)
 
 
 def test_help_of_clean_loads_nothing_heavy():

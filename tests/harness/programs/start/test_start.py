@@ -20,7 +20,7 @@ STATED = {
     "--camera": "azure_kinect_nfov",
     "--part": "board",
     "--damage": "hole",
-    "--tolerance": "5mm",
+    "--size": "5mm",
 }
 
 
@@ -86,8 +86,8 @@ def test_questions_are_asked_again_after_a_mistake(home: Path, monkeypatch, caps
         "--recording capturs: no such file",
         "--part shet: no such part; did you mean 'sheet'?",
         "--damage hol: no such damage here; did you mean 'hole'?",
-        "--tolerance 5: is not a length with a unit",
-        "--tolerance -3mm: is not a length",
+        "--size 5: is not a length with a unit",
+        "--size -3mm: is not a length",
         "--depth deep: is not a length",
         "--out mine: is no name",
         "--out mine.yaml: there is such a file",
@@ -147,11 +147,11 @@ def test_ctrl_c_writes_nothing(number: int, home: Path, monkeypatch, capsys) -> 
         ({"--camera": "./none.yaml"}, "none.yaml"),
         ({"--part": "bord"}, "did you mean 'board'?"),
         ({"--damage": "cauliflower"}, "--damage cauliflower: no such damage here"),
-        ({"--tolerance": "5 feet"}, "--tolerance 5 feet: is not a length"),
+        ({"--size": "5 feet"}, "--size 5 feet: is not a length"),
         ({"--depth": "1mm"}, "--depth: a hole goes through the part"),
         ({"--distance": "far"}, "--distance far: is not a length"),
         ({"--distance": "90m"}, "the answers do not fit together"),
-        ({"--tolerance": "9m"}, "the answers do not fit together"),
+        ({"--size": "9m"}, "the answers do not fit together"),
         ({"--recording": "nowhere"}, "--recording nowhere: no such file"),
         ({"--out": "a/b.yaml"}, "--out a/b.yaml: there is no folder a"),
         ({"--out": "b.txt"}, "--out b.txt: is no name"),
@@ -177,7 +177,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("kind", "part"), REFUSED)
 def test_damage_that_a_part_cannot_have_is_refused(kind, part, home: Path, capsys) -> None:
-    changed = {"--damage": kind, "--part": part, "--tolerance": "30mm"}
+    changed = {"--damage": kind, "--part": part, "--size": "30mm"}
     changed |= {} if kind == "through" else {"--depth": "0.5mm"}
     assert main(["start", *words_of({**STATED, **changed})]) == 2
     message = capsys.readouterr().err
