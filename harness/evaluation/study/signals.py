@@ -111,7 +111,7 @@ class SignalSizes:
     @property
     def a90_95_mm(self) -> float:
         """Upper bound of a90 at 95 % confidence."""
-        return self._quantiles(0.9, (0.95,))[0]
+        return float(self._quantiles(0.9, (0.95,))[0])
 
     def _size_at(self, pod: float) -> float:
         return self.lines[0].fit.curve.size_at(pod) if self.lines else np.nan
@@ -119,18 +119,18 @@ class SignalSizes:
     def _interval(self, pod: float) -> Interval:
         if not self.lines:
             return UNKNOWN
-        low, high = self._quantiles(pod, (1.0 - UPPER, UPPER))
+        low, high = self._quantiles(pod, (1.0 - UPPER, UPPER)).tolist()
         return Interval(low, high)
 
-    def _quantiles(self, pod: float, shares: Sequence[float]) -> list[float]:
+    def _quantiles(self, pod: float, shares: Sequence[float]) -> np.ndarray:
         """Return quantiles of a size by all lines, each weighted by its likelihood."""
         if not self.lines:
-            return [np.nan] * len(shares)
+            return np.full(len(shares), np.nan)
         logs = np.array([line.fit.log_likelihood for line in self.lines])
         weight = np.exp(logs - logs.max())
         sizes = np.concatenate([line.quantiles(pod) for line in self.lines])
         each = np.repeat(weight / weight.sum() / len(QUANTILES), len(QUANTILES))
-        return weighted_quantiles(sizes, each, shares).tolist()
+        return weighted_quantiles(sizes, each, shares)
 
 
 def sizes_from_signals(record: SetUpRecord, hits: HitMissFit | None) -> SignalSizes:
