@@ -99,8 +99,8 @@ class Comparison:
 
 def fewest_boards(set_ups: int) -> int:
     """Return the fewest shared boards with which the tests can show that one of the set-ups is
-    worse. If it is worse on every board, the p-value is 1 in 2^boards, multiplied by the questions
-    of all set-ups and the limit's two tests; a90 from signals is a third, for which fewer suffice."""
+    worse by its hits. If it is worse on every board, the p-value is 1 in 2^boards, multiplied by
+    the questions of all set-ups and the limit's two tests; signals need fewer."""
     return int(np.floor(np.log2(2 * QUESTIONS * set_ups / ALPHA))) + 1
 
 
