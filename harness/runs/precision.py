@@ -5,7 +5,7 @@ The journal keeps each batch's sizes before it runs, under a key of everything t
 them. So a study resumes to the same boards, also after a failed trial has been repeated."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from harness.vocabulary.provenance import source_digest
 from harness.vocabulary.seeds import canonical_json, digest
 from scenes.target.drawn import DrawnTargetConfig
 
+_limit_of = partial(limit_of, draws=10)
+"""No batch hangs on resampled boards, which serve comparisons."""
 RULE = ("harness.evaluation.study.sequential",)
 """With all that it imports, this module decides the sizes of a batch."""
 
@@ -136,9 +138,9 @@ class Batches:
                 records[point.digest] = record
         arguments = [(record,) for record in records.values()]
         limits = {}
-        for name, limit in zip(records, values_of(limit_of, arguments, engine), strict=True):
+        for name, limit in zip(records, values_of(_limit_of, arguments, engine), strict=True):
             # a process that was lost costs no batch
-            limits[name] = limit or limit_of(records[name])
+            limits[name] = limit or _limit_of(records[name])
         return limits
 
 

@@ -200,7 +200,8 @@ class HitsAndMisses:
         studies (d,) at (d, p)."""
         if self.penalty is None and self.hits.ndim == 1 and b.ndim == 2:
             by_row = self.design @ b.T + self.offset
-            return log_likelihoods(self.link, by_row, self.hits, self.misses).sum(axis=0)
+            rows = log_likelihoods(self.link, by_row, self.hits, self.misses)
+            return np.asarray(rows.sum(axis=0))
         predictor = b @ self.design.T + self.offset
         log_hit, log_miss, log_density = logs_of_link(self.link, predictor)
         value = (self.hits * log_hit + self.misses * log_miss).sum(axis=-1)

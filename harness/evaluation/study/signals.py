@@ -53,21 +53,33 @@ class SignalLine:
     error: float
     """Standard error of the threshold on the axis of signals."""
 
+    @property
+    def axes(self) -> tuple[bool, bool]:
+        """Whether the axes are of the logarithms of size and of signal."""
+        return self.fit.log_size, self.fit.log_signal
+
     def influence_at(self, pod: float) -> np.ndarray:
         """Return by how much each board (boards,) moves the size with this POD, on its axis."""
         return np.asarray(self.influence @ _weights(pod))
 
-    def of_threshold(self, pod: float) -> float:
-        """Return by how much one standard error of the threshold moves that size: equally at every
-        POD."""
+    @property
+    def of_threshold(self) -> float:
+        """By how much one standard error of the threshold moves every size, on its axis."""
         return self.error / self.fit.b1
+
+    def log_influence_at(self, pod: float) -> tuple[np.ndarray, float]:
+        """Return by how much each board (boards,), and one standard error of the threshold, move
+        the logarithm of that size."""
+        curve = self.fit.curve
+        unit = 1.0 if curve.log_size else curve.size_at(pod)
+        return self.influence_at(pod) / unit, self.of_threshold / unit
 
     def variance(self, pod: float) -> float:
         """Return the variance of that size on its axis."""
         weights = _weights(pod)
         of_damages = float(weights @ self.fit.curve.covariance @ weights)
         of_boards = sandwich(self.influence_at(pod))
-        return max(of_damages, of_boards) + self.of_threshold(pod) ** 2
+        return max(of_damages, of_boards) + self.of_threshold**2
 
     def quantiles(self, pod: float) -> np.ndarray:
         """Return evenly spaced quantiles of that size."""
@@ -111,7 +123,7 @@ class SignalSizes:
     @property
     def a90_95_mm(self) -> float:
         """Upper bound of a90 at 95 % confidence."""
-        return self._quantiles(0.9, (0.95,))[0]
+        return float(self._quantiles(0.9, (0.95,))[0])
 
     def _size_at(self, pod: float) -> float:
         return self.lines[0].fit.curve.size_at(pod) if self.lines else np.nan
@@ -119,18 +131,18 @@ class SignalSizes:
     def _interval(self, pod: float) -> Interval:
         if not self.lines:
             return UNKNOWN
-        low, high = self._quantiles(pod, (1.0 - UPPER, UPPER))
+        low, high = self._quantiles(pod, (1.0 - UPPER, UPPER)).tolist()
         return Interval(low, high)
 
-    def _quantiles(self, pod: float, shares: Sequence[float]) -> list[float]:
+    def _quantiles(self, pod: float, shares: Sequence[float]) -> np.ndarray:
         """Return quantiles of a size by all lines, each weighted by its likelihood."""
         if not self.lines:
-            return [np.nan] * len(shares)
+            return np.full(len(shares), np.nan)
         logs = np.array([line.fit.log_likelihood for line in self.lines])
         weight = np.exp(logs - logs.max())
         sizes = np.concatenate([line.quantiles(pod) for line in self.lines])
         each = np.repeat(weight / weight.sum() / len(QUANTILES), len(QUANTILES))
-        return weighted_quantiles(sizes, each, shares).tolist()
+        return weighted_quantiles(sizes, each, shares)
 
 
 def sizes_from_signals(record: SetUpRecord, hits: HitMissFit | None) -> SignalSizes:

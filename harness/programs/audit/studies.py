@@ -33,7 +33,7 @@ PLACES = 2000
 PEAKS = 10
 SET_BOARDS = 60  # hole-free boards that set the threshold
 COUNTED_BOARDS = 60  # hole-free boards on which false calls are counted
-DRAWS = 200
+DRAWS = 10  # of resampled boards, on which no claim hangs
 LAWS = {"Gaussian": stats.norm(), "Student 12": stats.t(12)}
 
 

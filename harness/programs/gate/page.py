@@ -85,10 +85,11 @@ COMPARED = Table(
 )
 TESTS = (
     "Lost, won: inspections with a hit in the first study only, and in the second only. The "
-    "p beside them is twice the "
-    "smaller of two p-values: that of a sign-flip test of hits with boards (not damages) as "
-    "units, and that of "
-    "Student's t of the change of a90 over 500 draws of boards. If the studies have "
+    "p beside them is the smallest "
+    "p-value times their number: of a sign-flip test of hits with boards (not damages) as "
+    "units, of "
+    "Student's t of the change of a90 over 500 draws of boards and, where signals contradict "
+    "no assumption, of a90 from signals over boards and both calibrations. If the studies have "
     "different boards, it is the share "
     "of draws of a90. The p of false calls is that of a sign-flip test if frames and "
     "threshold are the same; otherwise "
@@ -216,6 +217,8 @@ def _row_data(row: ComparedSetUps) -> dict[str, Any]:
             "bootstrap_p": {"grown": row.limit.grown_p, "shrunk": row.limit.shrunk_p},
             "decides": dict(zip(sides, row.limit_p, strict=True)),
         }
+    if row.by_signals is not None:
+        data["a90_change_by_signals"] = vars(row.by_signals)
     if row.hits is not None:
         data["hits"] = vars(row.hits)
     if row.signal is not None:

@@ -11,8 +11,10 @@ from scipy.stats import betabinom, hypergeom, t
 
 from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.pod.statement import POD
 from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
+from harness.evaluation.study.signals import SignalLine, sandwich
 from harness.vocabulary.errors import UserError
 
 Tails = tuple[float, float]
@@ -152,6 +154,62 @@ def limit_change(first: SetUpLimit, second: SetUpLimit, same_boards: bool) -> Li
         shrunk_p=shrunk_p,
         paired=paired,
     )
+
+
+@dataclass(frozen=True)
+class SignalLimitChange:
+    """Change of a90 from signals on the same boards, by Student's t with boards as units."""
+
+    # Second a90 over the first
+    ratio: float
+    # Both a90, millimetres
+    a90_mm: tuple[float, float]
+    # p-value of growth
+    grown_p: float
+    # p-value of shrinkage
+    shrunk_p: float
+
+
+def signal_limit_change(first: SetUpLimit, second: SetUpLimit) -> SignalLimitChange | None:
+    """Compare a90 from signals on the likeliest pair of axes that neither set-up contradicts; None
+    if there is none, or the boards are not the same.
+
+    A board moves both limits, so its influences are subtracted; each set-up has a threshold of its
+    own, whose errors add up."""
+    boards = [np.unique(limit.record.inspected.board) for limit in (first, second)]
+    if not np.array_equal(boards[0], boards[1]):
+        return None
+    lines_1 = {line.axes: line for line in first.from_signals.lines}
+    lines_2 = {line.axes: line for line in second.from_signals.lines}
+    shared = [axes for axes in lines_1 if axes in lines_2]
+    if not shared:
+        return None
+    axes = max(shared, key=lambda of: _log_likelihood(lines_1[of]) + _log_likelihood(lines_2[of]))
+    before = lines_1[axes].fit.curve.size_at(POD)
+    now = lines_2[axes].fit.curve.size_at(POD)
+    if not min(before, now) > 0:
+        return None
+    moved_1, by_threshold_1 = lines_1[axes].log_influence_at(POD)
+    moved_2, by_threshold_2 = lines_2[axes].log_influence_at(POD)
+    variance = sandwich(moved_2 - moved_1)
+    if not np.isclose(first.record.threshold, second.record.threshold, rtol=SAME, atol=0.0):
+        variance += by_threshold_1**2 + by_threshold_2**2
+    change = float(np.log(now / before))
+    grown_p = float(change <= 0)
+    shrunk_p = float(change >= 0)
+    if variance > 0:
+        score = change / np.sqrt(variance)
+        grown_p, shrunk_p = t.sf([score, -score], len(moved_1) - 1).tolist()
+    return SignalLimitChange(
+        ratio=now / before,
+        a90_mm=(before, now),
+        grown_p=grown_p,
+        shrunk_p=shrunk_p,
+    )
+
+
+def _log_likelihood(line: SignalLine) -> float:
+    return line.fit.log_likelihood
 
 
 SAME = 1e-6  # relative difference of equal thresholds between machines

@@ -2,8 +2,9 @@
 judges benchmarks. A set-up is worse if its a90 or its rate of false calls has grown (or its
 signals over the threshold have fallen) by more than `MARGIN` and by more than chance explains, by
 Holm's step-down method over the three questions of all set-ups at `ALPHA`; or if it has lost its
-limit. On the same boards, the tests of hits and of a90 decide on the limit; on other boards, the
-bootstrap of a90 does. See `harness.programs.gate.paired`."""
+limit. On the same boards, the tests of hits, of a90 and, where signals contradict no assumption, of
+a90 from signals decide on the limit; on other boards, the bootstrap of a90 does. See
+`harness.programs.gate.paired`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ class ComparedSetUps:
     changed: tuple[str, ...] = ()
     # Change of a90; None if the two are not comparable
     limit: paired.LimitChange | None = None
+    # Change of a90 from signals; None on other boards, or where they are not stated
+    by_signals: paired.SignalLimitChange | None = None
     # Change of hits; None on other boards
     hits: paired.HitsChange | None = None
     # Change of false calls; None without hole-free boards
@@ -96,8 +99,8 @@ class Comparison:
 
 def fewest_boards(set_ups: int) -> int:
     """Return the fewest shared boards with which the tests can show that one of the set-ups is
-    worse. If it is worse on every board, the p-value is 1 in 2^boards, multiplied by the questions
-    of all set-ups and the limit's two tests."""
+    worse by its hits. If it is worse on every board, the p-value is 1 in 2^boards, multiplied by
+    the questions of all set-ups and the limit's two tests; signals need fewer."""
     return int(np.floor(np.log2(2 * QUESTIONS * set_ups / ALPHA))) + 1
 
 
@@ -129,6 +132,7 @@ def compare_studies(first: StudyRecord, second: StudyRecord, alpha: float = ALPH
                 second=now,
                 changed=changed,
                 limit=paired.limit_change(before, now, same),
+                by_signals=paired.signal_limit_change(before, now) if same else None,
                 hits=hits,
                 calls=calls,
                 signal=signal,
@@ -246,11 +250,13 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
     signal = None if row.signal is None else (row.signal.less_p, row.signal.more_p)
     if row.limit is None:
         return None, calls, signal
-    worse = row.limit.grown_p
-    better = row.limit.shrunk_p
-    if row.hits is not None and row.limit.paired:  # the better of two tests counts twice
-        worse = min(1.0, 2 * min(worse, row.hits.fewer_p))
-        better = min(1.0, 2 * min(better, row.hits.more_p))
+    tests = [(row.limit.grown_p, row.limit.shrunk_p)]
+    if row.hits is not None and row.limit.paired:
+        tests.append((row.hits.fewer_p, row.hits.more_p))
+    if row.by_signals is not None:
+        tests.append((row.by_signals.grown_p, row.by_signals.shrunk_p))
+    # the best of several tests counts as often as there are tests
+    worse, better = (min(1.0, len(tests) * min(p)) for p in zip(*tests, strict=True))
     return (worse, better), calls, signal
 
 
@@ -268,8 +274,12 @@ def _verdict(row: ComparedSetUps, alpha: float) -> tuple[Mark, str]:
     if why := _lost(first, second):
         return "newly failing", why
     margin = limit_margin(row.signal)
-    if growth > margin and row.limit_p[0] < alpha:
-        return "worse", grown
+    if row.limit_p[0] < alpha:
+        if growth > margin:
+            return "worse", grown
+        if row.by_signals is not None and row.by_signals.ratio > MARGIN:
+            before_mm, now_mm = row.by_signals.a90_mm
+            return "worse", f"a90 by signals {before_mm:.2f} → {now_mm:.2f} mm"
     if calls is not None and calls.ratio > MARGIN and row.calls_p[0] < alpha:
         calls_before, calls_now = calls.rates_per_m2
         return "worse", f"false calls {calls_before:.2f} → {calls_now:.2f} per m²"

@@ -10,9 +10,11 @@ import pytest
 from scipy import special
 
 from harness.evaluation.pod.hit_miss import fit_hit_miss
+from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import SetUpRecord, ThresholdError
 from harness.evaluation.study.signals import SATURATED, SignalSizes, sandwich, sizes_from_signals
 from harness.programs.audit.studies import StudyCase, drawn_threshold, recorded
+from harness.programs.gate.paired import signal_limit_change
 from harness.vocabulary.seeds import random_stream
 
 A50_MM = 6.0
@@ -154,3 +156,55 @@ def test_without_data_it_says_so():
     assert "several units" in sizes(dataclasses.replace(record, units=2)).why
     high = with_signal(record, np.where(record.inspected.hit, 1e3, 0.0))
     assert "0 signals lie between" in sizes(high).why
+
+
+class TestChange:
+    """The change of a90 from signals between two set-ups."""
+
+    def test_weaker_signals_raise_it_and_boards_cancel(self):
+        record = studied(7, boards_mm=1.5)
+        weaker = record.inspected.signal - 0.8
+        lost = record.inspected.hit & (weaker > record.threshold)
+        inspected = dataclasses.replace(record.inspected, signal=weaker, hit=lost)
+        first = limit_of(record, draws=2)
+        second = limit_of(dataclasses.replace(record, inspected=inspected), draws=2)
+        change = signal_limit_change(first, second)
+        assert change is not None
+        before_mm, now_mm = change.a90_mm
+        # 0.8 for each mm; a90 itself is uncertain by 0.5
+        assert now_mm - before_mm == pytest.approx(1.0, abs=0.25)
+        assert change.ratio == now_mm / before_mm
+        assert change.grown_p < 1e-6
+        assert change.grown_p + change.shrunk_p == pytest.approx(1.0)
+        backwards = signal_limit_change(second, first)
+        assert backwards is not None
+        assert backwards.shrunk_p == pytest.approx(change.grown_p)
+
+    def test_errors_of_two_thresholds_count_and_of_one_do_not(self):
+        record = studied(8)
+        error = ThresholdError(error=0.4, low_per_m2=0.5, high_per_m2=2.0, method="test")
+        record = dataclasses.replace(record, threshold_error=error)
+        same = limit_of(record, draws=2)
+        change = signal_limit_change(same, same)
+        assert change is not None
+        assert (change.ratio, change.grown_p, change.shrunk_p) == (1.0, 1.0, 1.0)
+        threshold = record.threshold + 0.4
+        hit = record.inspected.hit & (record.inspected.signal > threshold)
+        inspected = dataclasses.replace(record.inspected, hit=hit)
+        other = limit_of(
+            dataclasses.replace(record, threshold=threshold, inspected=inspected), draws=2
+        )
+        moved = signal_limit_change(same, other)
+        assert moved is not None
+        assert moved.ratio > 1.03
+        # one of two standard errors, with a little of the boards besides
+        assert 0.2 < moved.grown_p < 0.3
+
+    def test_it_needs_the_same_boards_and_lines(self):
+        record = studied(9)
+        inspected = dataclasses.replace(record.inspected, board=record.inspected.board + 1)
+        other = dataclasses.replace(record, inspected=inspected)
+        limit = limit_of(record, draws=2)
+        assert signal_limit_change(limit, limit_of(other, draws=2)) is None
+        without = dataclasses.replace(limit, from_signals=SignalSizes(why="none"))
+        assert signal_limit_change(limit, without) is None

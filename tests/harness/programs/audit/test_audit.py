@@ -66,6 +66,9 @@ def test_a_study_claims_all_quantities_and_the_same_again() -> None:
         "a90",
         "a90/95",
         "a90/95 over boards",
+        "a50 by signals",
+        "a90 by signals",
+        "a90/95 by signals",
         "true rate at the threshold",
         "counted rate",
     }

@@ -18,6 +18,7 @@ from harness.programs.gate.paired import (
     CallsChange,
     LimitChange,
     SignalChange,
+    SignalLimitChange,
     _rank,
     _threshold_variance,
     calls_change,
@@ -430,6 +431,10 @@ def row_of(growth: float, **changes: Any) -> ComparedSetUps:
     return ComparedSetUps(first, second, **changes)
 
 
+def by_signals(ratio: float) -> SignalLimitChange:
+    return SignalLimitChange(ratio, (5.0, 5.0 * ratio), grown_p=0.002, shrunk_p=0.5)
+
+
 SURE = (1e-4, 1e-4)
 UNSURE = (0.001, 0.001)
 
@@ -446,6 +451,9 @@ UNSURE = (0.001, 0.001)
         (1.11, {"limit_p": (1e-4, 1.0)}, "worse"),
         (1.11, {"limit_p": (1.0, 1e-4)}, "not significant"),
         (1 / 1.11, {"limit_p": (1e-4, 1.0)}, "not significant"),
+        (1.0, {"limit_p": SURE, "by_signals": by_signals(1.11)}, "worse"),
+        (1.0, {"limit_p": SURE, "by_signals": by_signals(1.09)}, "as good"),
+        (1.0, {"limit_p": UNSURE, "by_signals": by_signals(1.11)}, "as good"),
         # two standard errors of 5 % widen the margin to 1.1 exp(0.1) = 1.216
         (1.21, {"limit_p": SURE, "signal": signal_of(1.0, 0.05)}, "not significant"),
         (1.22, {"limit_p": SURE, "signal": signal_of(1.0, 0.05)}, "worse"),
@@ -497,7 +505,7 @@ def test_the_margin_widens_with_the_error_of_signals() -> None:
     assert limit_margin(signal_of(1.0, 0.1)) == pytest.approx(1.1 * np.exp(0.2))
 
 
-def test_the_better_of_two_tests_of_a_limit_counts_twice() -> None:
+def test_the_best_of_several_tests_of_a_limit_counts_as_often() -> None:
     limit = limit_change(a_limit(), a_limit(), True)
     limit = replace(limit, grown_p=0.2, shrunk_p=0.03)
     hits = hits_change(a_record().inspected, a_record().inspected)
@@ -513,6 +521,8 @@ def test_the_better_of_two_tests_of_a_limit_counts_twice() -> None:
     assert of_limit(limit) == (0.2, 0.03)
     assert of_limit(limit, hits=hits) == pytest.approx((0.02, 0.06))
     assert of_limit(replace(limit, paired=False), hits=hits) == (0.2, 0.03)
+    three = of_limit(limit, hits=hits, by_signals=by_signals(1.2))
+    assert three == pytest.approx((0.006, 0.09))
     assert of_limit(replace(limit, grown_p=0.9), hits=replace(hits, fewer_p=0.8))[0] == 1.0
     signal = replace(signal_of(1.0), less_p=0.1, more_p=0.6)
     assert _p_values(row_of(1.0, signal=signal)) == (None, None, (0.1, 0.6))
