@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.programs.dataset.score_detector import DETECTOR
+from harness.programs.dataset.score_rank import RANK
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, write_text
 from harness.vocabulary.geometry import MM
@@ -75,7 +77,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "likely damage. In the layout of MVTec 3D-AD, sizes are those of circles with the area of "
     "each region of a mask, and maps of validation may be left out.",
     epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
-    "two such folders of results.",
+    "two such folders of results, tofpod score rank any number; tofpod score detector NAME writes "
+    "the maps of a detector.",
+    further={"detector": DETECTOR, "rank": RANK},
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
