@@ -61,6 +61,7 @@ ONLY_PARSED = {
     "validate --board plate": "takes minutes; test_validate_board runs --board on a smaller plate",
     "compare A B": "stands for two folders; test_compare runs the program",
     "artefacts --": "makes answers of the checkout again; test_making runs it elsewhere",
+    "--filter acme_smooth": "needs the reader's package; test_streams offers such filters",
     "yours.yaml": "stands for the reader's own file",
     "captures/part --reference": "needs captures of parts that are alike; test_references runs it",
 }
@@ -244,6 +245,10 @@ SMALL = {
         "source.render={bounces: 0}",
         "sweep={capture.frames: [1]}",
     ),
+    "filters": (
+        *SMALL_STUDY[:-1],
+        "sweep={capture.filter: [null, {name: median}], capture.frames: [1]}",
+    ),
     "averaging": (*SMALL_REPEATS, "sweep={capture.frames: [1, 5]}"),
     "cameras": (*SMALL_REPEATS, "sweep={source.camera.name: [azure_kinect_nfov, kinect_v2]}"),
     "anatomy": (
@@ -253,7 +258,7 @@ SMALL = {
     ),
     "perspectives": (*SMALL_REPEATS, "capture.frames=5", "sweep={mapping.views: [1, 2]}"),
 }
-IN_RESULTS = ("sweep", "efficiency", "coverage", "ask", "design", "ls")
+IN_RESULTS = ("sweep", "efficiency", "filters", "coverage", "ask", "design", "ls")
 MORE = {
     "implant": ("--targets", "8", "--hit-radius", "6", "--apart", "32"),
     "design": ("--studies", "20"),
@@ -261,6 +266,7 @@ MORE = {
     "sweep": ("--serial",),
     "train": ("--serial", "--passes", "1", "--channels", "2"),
     "efficiency": ("--serial",),
+    "filters": ("--serial",),
 }
 
 
@@ -269,7 +275,7 @@ def shrunk(name: str, given: list[str]) -> list[str]:
     later and counts."""
     small = (
         SMALL.get(Path(given[0]).stem, ())
-        if name in ("sweep", "export", "dataset", "coverage", "train")
+        if name in ("sweep", "export", "dataset", "coverage", "train", "filters")
         else ()
     )
     settings = [word for change in small for word in ("--set", change)]

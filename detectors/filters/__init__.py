@@ -38,7 +38,7 @@ FILTERS = PlugIns(GROUP, "filter", lambda: BUILT_IN)
 _functions: dict[str, FunctionFilter] = {}  # those of `functions_named`
 
 
-class FilterConfig(Config):
+class DepthFilterConfig(Config):
     """A filter by name, its settings, which each filter declares, and what it acts on."""
 
     name: str

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from detectors.averages.average import AverageConfig, prefix_averages
-from detectors.filters import FilterConfig, load_filter
+from detectors.filters import DepthFilterConfig, load_filter
 from detectors.filters.interface import DepthFilter, DepthFunction
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, Lens, Reason, Region
@@ -74,7 +74,7 @@ def averages_through(
     source: FrameSource,
     counts: Sequence[int],
     average: AverageConfig,
-    config: FilterConfig | None,
+    config: DepthFilterConfig | None,
 ) -> dict[int, Cloud]:
     """Return the averages of the first n frames for each n in ``counts``, by `prefix_averages`,
     with a filter before or behind them. Raises UserError."""

@@ -69,7 +69,7 @@ class TemporalFilter:
 
 @dataclass
 class _History:
-    """What a stream's frames left."""
+    """The past of a stream of frames."""
 
     settings: TemporalConfig
     """Settings of the filter."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from detectors import detector_names
-from detectors.filters import FilterConfig, filter_names, load_filter
+from detectors.filters import DepthFilterConfig, filter_names, load_filter
 from harness.experiment.schema import (
     CaptureSource,
     ExperimentConfig,
@@ -299,7 +299,7 @@ def _mapping_problems(
         )
 
 
-def _filter_problems(depth_filter: FilterConfig, source: Source) -> Iterator[Problem]:
+def _filter_problems(depth_filter: DepthFilterConfig, source: Source) -> Iterator[Problem]:
     """Report a filter over frames that is to act on an average, which is a single picture."""
     loaded = load_filter(depth_filter.name, depth_filter.settings)
     if depth_filter.acts_on == "average" and getattr(loaded, "remembers_frames", False):

@@ -19,7 +19,7 @@ from detectors import DETECTORS, detector_names, detector_type
 from detectors.averages.average import AverageConfig
 from detectors.averages.flat_field import FlatFieldConfig
 from detectors.filters import (
-    FilterConfig,
+    DepthFilterConfig,
     filter_names,
     filter_origin,
     filter_settings_type,
@@ -103,7 +103,7 @@ class CaptureConfig(Config):
         None,
         description="a plane captured first, whose fixed pattern is subtracted from every frame",
     )
-    filter: FilterConfig | None = Field(None, description="a filter from depth to depth")
+    filter: DepthFilterConfig | None = Field(None, description="a filter from depth to depth")
 
 
 class DetectorConfig(Config):

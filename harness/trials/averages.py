@@ -8,7 +8,7 @@ from functools import lru_cache
 from detectors.averages.average import AverageConfig
 from detectors.averages.flat_captures import flattened, separated
 from detectors.averages.flat_field import FlatField, FlatFieldConfig, corrected
-from detectors.filters import FilterConfig
+from detectors.filters import DepthFilterConfig
 from detectors.filters.stream import averages_through
 from harness.vocabulary.geometry import Cloud
 from scenes.closed_form import plane_view
@@ -29,14 +29,14 @@ class Averaging:
     flat_field: FlatFieldConfig | None = None
     """The flat field to subtract."""
     filter_json: str | None = None
-    """A `FilterConfig` as canonical JSON; None without a filter."""
+    """A `DepthFilterConfig` as canonical JSON; None without a filter."""
 
     @property
-    def filter(self) -> FilterConfig | None:
+    def filter(self) -> DepthFilterConfig | None:
         """The filter."""
         if self.filter_json is None:
             return None
-        return FilterConfig.from_data(json.loads(self.filter_json))
+        return DepthFilterConfig.from_data(json.loads(self.filter_json))
 
 
 def averages_of(

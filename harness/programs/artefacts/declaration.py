@@ -20,7 +20,7 @@ from harness.vocabulary.words import nearest
 from scenes.sensor.camera import camera_names
 
 FILE = Path(__file__).with_name("artefacts.yaml")
-STUDIES = ("sweep", "check")
+STUDIES = ("sweep", "check", "filters")
 """Programs of which the first argument is an experiment, whose digests count."""
 
 

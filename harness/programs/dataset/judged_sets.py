@@ -86,6 +86,10 @@ class BoardSet:
         """Return the boards of `VALIDATION` and ``test``."""
         return {name for name in self._samples if name.split("/")[1] in (VALIDATION, "test")}
 
+    def learning(self, category: str) -> list[str]:
+        """Return the good boards of ``train`` in a category."""
+        return sorted(name for name in self._samples if name.startswith(f"{category}/train/good/"))
+
     def picture(self, name: str) -> JudgedPicture:
         """Read a board."""
         inspected, places_m, damage = read_arrays(

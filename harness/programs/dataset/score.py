@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.programs.dataset.score_detector import DETECTOR
+from harness.programs.dataset.score_rank import RANK
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import PICTURE_BYTES, bounded_bytes, write_text
 from harness.vocabulary.geometry import MM
@@ -76,7 +78,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "each region of a mask, and maps of validation may be left out.",
     "tofpod score maps --dataset boards --out scores",
     "tofpod score maps --dataset boards --name ours --out scores",
-    epilog="tofpod compare compares two such folders of results.",
+    epilog="tofpod compare compares two such folders of results, tofpod score rank any number; "
+    "tofpod score detector NAME writes the maps of a detector.",
+    further={"detector": DETECTOR, "rank": RANK},
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""

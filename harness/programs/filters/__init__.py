@@ -1,1 +1,1 @@
-"""``tofpod filters``: what a filter from depth to depth costs."""
+"""``tofpod filters``: states what a filter from depth to depth costs."""

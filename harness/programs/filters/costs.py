@@ -1,4 +1,4 @@
-"""What a filter does to the smallest damage that is found, to false calls and to sizes.
+"""Changes by a filter of the smallest damage that is found, of false calls and of sizes.
 
 Set-ups of a study that differ in the filter alone inspect the same frames of the same boards, and
 each has a threshold of its own for the same rate of false calls; so differences are paired, over

@@ -1,4 +1,4 @@
-"""From the results of a study with filters to its table and page."""
+"""Judges the filters of a finished study, and writes their table and page."""
 
 from __future__ import annotations
 

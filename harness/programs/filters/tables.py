@@ -71,6 +71,13 @@ FILTER_COSTS = Table(
             interval=True,
             tone=_tone,
         ),
+        Column(
+            "a90_stated",
+            "",
+            lambda row: a90_of(row.limit).text(),
+            "a90 in words, bounded by the largest size inspected",
+        ),
+        Column("change_stated", "", lambda row: _signed(_change(row)), "the change, likewise"),
         Column("lost", "", "lost", "inspections in which damage is found without the filter only"),
         Column("gained", "", "gained", "inspections in which it is found with the filter only"),
         replace(

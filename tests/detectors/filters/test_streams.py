@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from detectors.averages.average import AverageConfig, prefix_averages
-from detectors.filters import FilterConfig, filter_names, functions_named, load_filter
+from detectors.filters import DepthFilterConfig, filter_names, functions_named, load_filter
 from detectors.filters.stream import FilteredFrames, averages_through
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Reason, Region
@@ -31,7 +31,7 @@ def capture() -> SimulatedCapture:
 
 
 def test_frames_pass_the_filter_in_order_before_the_average(capture: SimulatedCapture):
-    through = averages_through(capture, COUNTS, MEAN, FilterConfig(name="temporal"))
+    through = averages_through(capture, COUNTS, MEAN, DepthFilterConfig(name="temporal"))
     plain = prefix_averages(capture, COUNTS, MEAN)
     function = load_filter("temporal", {}).started(
         capture.z_step_m or 0.001, whole=capture.z_step_m > 0
@@ -43,7 +43,7 @@ def test_frames_pass_the_filter_in_order_before_the_average(capture: SimulatedCa
 
 
 def test_an_average_passes_the_filter_without_rounding(capture: SimulatedCapture):
-    config = FilterConfig(name="spatial", acts_on="average")
+    config = DepthFilterConfig(name="spatial", acts_on="average")
     through = averages_through(capture, [6], MEAN, config)[6]
     plain = prefix_averages(capture, [6], MEAN)[6]
     z_m = through.points_m[..., 2]
@@ -71,7 +71,7 @@ def test_reasons_follow_what_a_filter_fills_and_removes(capture: SimulatedCaptur
 def test_a_function_is_a_filter_of_this_process_only_while_it_is_named(capture: SimulatedCapture):
     with functions_named({"halved": lambda z_m: z_m / 2}):
         assert "halved" in filter_names()
-        cloud = averages_through(capture, [1], MEAN, FilterConfig(name="halved"))[1]
+        cloud = averages_through(capture, [1], MEAN, DepthFilterConfig(name="halved"))[1]
     plain = prefix_averages(capture, [1], MEAN)[1]
     assert np.allclose(cloud.points_m, plain.points_m / 2, equal_nan=True)
     with pytest.raises(UserError, match="there is no filter 'halved'"):
@@ -88,7 +88,7 @@ def test_another_package_offers_a_function_or_a_class(
     )
     entries = {"nearer": "acme_filters:nearer", "broken": "acme_filters:broken"}
     offer(monkeypatch, tmp_path, "acme-filters", "tofpod.filters", entries)
-    cloud = averages_through(capture, [1], MEAN, FilterConfig(name="nearer"))[1]
+    cloud = averages_through(capture, [1], MEAN, DepthFilterConfig(name="nearer"))[1]
     plain = prefix_averages(capture, [1], MEAN)[1]
     assert np.allclose(cloud.points_m[..., 2], plain.points_m[..., 2] - 0.01, equal_nan=True)
     with pytest.raises(UserError, match="neither a class nor a function"):
@@ -113,4 +113,4 @@ def test_a_filter_that_changes_the_size_is_refused(capture: SimulatedCapture):
         functions_named({"small": lambda z_m: z_m[::2, ::2]}),
         pytest.raises(UserError, match="returns 12 x 17 pixels for 24 x 34"),
     ):
-        averages_through(capture, [1], MEAN, FilterConfig(name="small"))
+        averages_through(capture, [1], MEAN, DepthFilterConfig(name="small"))
