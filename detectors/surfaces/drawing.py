@@ -43,8 +43,6 @@ from harness.vocabulary.meshes import (
 
 ROLLS = 4
 """Starts by quarters of a turn."""
-FEW = 500
-"""Points that choose among the starts; the chosen one is then fitted to all of the sample."""
 
 
 class DrawingFile(Config):
@@ -95,7 +93,9 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
     the lens (``central``) or along z. Raises UserError if the points are not of this part."""
     sample = sampled(points)
     _refuse_unit(drawing, points)
-    pose = _placed(drawing.front, sample)
+    front = drawing.front
+    starts = [_start(front, sample, turn) for turn in range(ROLLS)]
+    pose = closest_of([fitted(front, sample, start) for start in starts])
     overlap = _refuse_other(drawing, pose, sample, central)
     return expected(
         drawing.triangles,
@@ -106,15 +106,6 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
         text=_text(drawing, pose),
         facts=_facts(drawing, pose, overlap),
     )
-
-
-def _placed(front: Triangles, sample: np.ndarray) -> Pose:
-    """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
-    few = sample[:: max(1, len(sample) // FEW)]
-    starts = [_start(front, sample, turn) for turn in range(ROLLS)]
-    trials = [fitted(front, few, start) for start in starts]
-    best = closest_of(trials)
-    return fitted(front, sample, starts[trials.index(best)])
 
 
 def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:

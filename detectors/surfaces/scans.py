@@ -357,6 +357,10 @@ class GoodParts:
     noises_m2: np.ndarray
     """(k, n): variance of that z by the noise of its capture."""
 
+    def first_parts(self, count: int) -> GoodParts:
+        """Return the first ``count`` parts."""
+        return GoodParts(self.first, self.central, self.heights_m[:count], self.noises_m2[:count])
+
     def mean(self, name: str, left_out: int | None = None) -> PartScan:
         """Return the mean of all parts, or of all but one, with the variance of the next part.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from detectors import detector_names
+from detectors import detector_names, detector_type
 from detectors.filters import DepthFilterConfig, filter_names, load_filter
 from harness.experiment.schema import (
     CaptureSource,
@@ -75,7 +75,22 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
             problems += check(config, config.source, source)
     else:
         problems += _capture_problems(config, config.source, source)
+    problems += _reference_problems(config, source)
     return config, [*problems, *_study_problems(config, source), *_unknown_problems(config, source)]
+
+
+def _reference_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
+    """Find what a board cannot be compared with a reference in."""
+    if config.reference is None:
+        return
+    position = source.key_place_of(("reference",))
+    if config.study is None or config.mapping is not None:
+        fix = "add study: {boards: 10, hole_free_boards: 10}, without source.views"
+        yield Problem("a reference needs a study of single views", position, fix=fix)
+    name = config.detector.name
+    if "surface" not in detector_type(name).settings_type.model_fields:
+        message = f"detector {name} has no surface setting, so that it knows no reference"
+        yield Problem(message, source.place_of(DETECTOR_NAME), legal="local, matched or thesis")
 
 
 def _unknown_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:

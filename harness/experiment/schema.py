@@ -177,6 +177,30 @@ class MatchingConfig(Config):
     )
 
 
+class ScanReference(Config):
+    """An earlier capture of the same board, before it was damaged, in another pose."""
+
+    kind: Literal["scan"]
+
+
+class GoodPartsReference(Config):
+    """Captures of other boards of the family without damage."""
+
+    kind: Literal["good_parts"]
+    parts: Annotated[int, Field(ge=1, le=50)]
+
+
+class MeshReference(Config):
+    """The drawing: the board without damage and without what differs between made parts."""
+
+    kind: Literal["mesh"]
+
+
+AnyReference = Annotated[
+    ScanReference | GoodPartsReference | MeshReference, Field(discriminator="kind")
+]
+
+
 class ValuesVariation(Config):
     """A variation that sets one key to each of the values in turn."""
 
@@ -275,6 +299,11 @@ class ExperimentConfig(Config):
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
     mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
+    reference: AnyReference | None = Field(
+        None,
+        description="in a study of single views: what each board is compared with, by the same "
+        "camera and number of frames; null: a surface that is fitted to it",
+    )
     detector: DetectorConfig = DetectorConfig()
     threshold: ThresholdConfig
     matching: MatchingConfig = MatchingConfig()
@@ -306,6 +335,13 @@ class ExperimentConfig(Config):
         ),
     )
     sensitivity: SensitivityConfig | None = None
+
+    @property
+    def detector_settings(self) -> dict[str, Any]:
+        """The detector's settings; with a reference, its surface is what that says."""
+        if self.reference is None:
+            return self.detector.settings
+        return {**self.detector.settings, "surface": {"shape": "expected"}}
 
     @property
     def simulated(self) -> SimulatedSource:
@@ -453,6 +489,9 @@ def point_of(
         }
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in SHARED_BY_POINTS}
+    if config.reference is None:
+        # points without one keep their digests
+        del numbers["reference"]
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}

@@ -19,7 +19,7 @@ import numpy as np
 from detectors.interface import Detector
 from detectors.pixels.masks import grown
 from harness.evaluation import intervals
-from harness.inspection.verdict import pitch_mm, surface_points_m, surface_steps_m
+from harness.inspection.verdict import pitch_mm, sight_lines, surface_points_m
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, Cloud
@@ -256,15 +256,8 @@ def pressed_in(
 def _along_ray(cloud: Cloud, surface_m: np.ndarray) -> np.ndarray:
     """Return (h, w, 3): the step along each ray that leads one metre behind the surface, measured
     across it; 0 where the surface is not known."""
-    rays = np.zeros_like(surface_m)
-    rays[..., 2] = 1.0
-    if cloud.projection == "central":
-        rays = surface_m / surface_m[..., 2:]
-    along_row, along_column = surface_steps_m(surface_m)
-    normals = np.cross(along_row, along_column)
-    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    cosines = np.abs((normals * rays).sum(axis=-1, keepdims=True))
-    return np.asarray(np.nan_to_num(rays / cosines))
+    rays, cosines = sight_lines(cloud, surface_m)
+    return np.asarray(np.nan_to_num(rays / cosines[..., None]))
 
 
 def free_area(result: Judged) -> np.ndarray:

@@ -40,6 +40,7 @@ from harness.inspection.references import (
     seen,
 )
 from harness.inspection.several_views import merged_views, mistakes_named, registration_data
+from harness.inspection.sheets import Sheets
 from harness.inspection.tolerance import (
     PartDecision,
     Tolerance,
@@ -150,7 +151,9 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     cli.refuse_misfits(arguments, paths)
     refuse_thresholds(arguments)
     cli.limit_depth_m(arguments)
-    tolerances = tolerances_from(arguments.tolerance)
+    reference = arguments.reference
+    has_drawing = reference is not None and cli.is_mesh(reference)
+    tolerances = tolerances_from(arguments.tolerance, has_drawing=has_drawing)
     detectors = _detectors_of(arguments, config)
     capture = _captured(arguments, paths, config, detectors[0][0])
     candidate = _chosen(arguments, detectors, capture)
@@ -563,6 +566,14 @@ def write_inspection(
     if run.changes is not None:
         changes_csv = run.changes.csv_text
         files[outputs.CHANGE.name] = lambda path: path.write_text(changes_csv, encoding="utf-8")
+    if run.decision is not None:
+        sheets = Sheets(run.decision, _decision_rows(run), facts["provenance"]["files"])
+        files[outputs.DECISION.name] = lambda path: path.write_text(
+            sheets.html(run.result), encoding="utf-8"
+        )
+        files[outputs.DECISION_DATA.name] = lambda path: path.write_text(
+            plain_json(sheets.facts), encoding="utf-8"
+        )
     page = partial(_page_html, run, subject, scene, facts["provenance"], further_warnings)
     files[outputs.INSPECTION_PAGE.name] = lambda path: path.write_text(page(), encoding="utf-8")
     written = write_findings(
@@ -782,7 +793,7 @@ def _sections(run: Inspection) -> dict[str, Markup]:
     """Return the sections that only some inspections have, by their headings."""
     sections = {}
     if run.decision is not None:
-        sections["Within tolerance?"] = decision_section(run.decision, _decision_rows(run))
+        sections["Within tolerance?"] = decision_section(run.decision)
     if run.changes is not None:
         sections["What changed"] = changes_section(run.changes)
     if run.limit is not None:
@@ -838,6 +849,8 @@ def _files_text(run: Inspection) -> dict[str, str]:
         shown.append(outputs.TARGETS)
     if run.changes is not None:
         shown.append(outputs.CHANGE)
+    if run.decision is not None:
+        shown += [outputs.DECISION, outputs.DECISION_DATA]
     files = {shown_file.name: shown_file.note for shown_file in shown}
     if run.mapped is None:
         files[outputs.CLOUD.name] = outputs.CLOUD.note

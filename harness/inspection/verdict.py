@@ -253,6 +253,19 @@ def surface_points_m(cloud: Cloud, surface_z_m: np.ndarray) -> np.ndarray:
     return np.concatenate([across_m, surface_z_m[..., None]], axis=-1)
 
 
+def sight_lines(cloud: Cloud, surface_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rays (h, w, 3), one metre along z, and their cosines (h, w) with the normals of
+    the surface, times their length; NaN where the surface is not known."""
+    rays = np.zeros_like(surface_m)
+    rays[..., 2] = 1.0
+    if cloud.projection == "central":
+        rays = surface_m / surface_m[..., 2:]
+    along_row, along_column = surface_steps_m(surface_m)
+    normals = np.cross(along_row, along_column)
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return rays, np.abs((normals * rays).sum(axis=-1))
+
+
 def surface_steps_m(surface_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps (h, w, 3) to the neighbours along the row and along the column."""
     return _neighbour_steps(surface_m, axis=1), _neighbour_steps(surface_m, axis=0)

@@ -64,6 +64,10 @@ TARGETS = Output(
 )
 BLIND = Output("blind.png", "the pixels without a return", "capture", "capture")
 GAUGE_ROWS = Output("gauge.csv", "hits and misses of a gauge board's holes", "capture", "capture")
+DECISION = Output(
+    "decision.html", "the decision on the tolerances, to print and sign", "capture", "capture"
+)
+DECISION_DATA = Output("decision.json", "the same for programs", "capture", "capture")
 CHANGE = Output(
     "change.csv",
     "distances from the earlier capture, with their level of detection",
@@ -94,6 +98,8 @@ FILES = (
     BLIND,
     GAUGE_ROWS,
     CHANGE,
+    DECISION,
+    DECISION_DATA,
     CLOUD,
 )
 JOURNAL = "journal"

@@ -25,7 +25,7 @@ from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, LabelledCloud, load_board
 from harness.trials.clouds import MapClouds, TrialPoint, mapping_of
 from harness.trials.judge import Criteria, Judgement, detector_for, judge
-from harness.trials.trial import Trial, capture_of, clouds_of
+from harness.trials.trial import Trial, capture_of, clouds_of, view_clouds
 from harness.vocabulary.geometry import MM, transform_points
 from scenes.target.truth import Damage, face_of
 
@@ -50,8 +50,8 @@ def _seen_again(trial: Trial, point: TrialPoint, most: int) -> LabelledCloud:
     """Return the cloud of one view like a trial that drew ``most`` frames."""
     board = load_board(trial.views[0])
     capture = capture_of(trial, 0, board, most)
-    clouds = averages_of(capture, [point.frames], point.averaging)
-    return board.labelled(clouds[point.frames])
+    averages = averages_of(capture, [point.frames], point.averaging)
+    return view_clouds(trial, board, averages).labelled(point)
 
 
 def _found(labelled: LabelledCloud, criteria: Criteria) -> tuple[Evidence, np.ndarray]:

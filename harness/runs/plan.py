@@ -19,7 +19,15 @@ from detectors import DETECTORS
 from detectors.filters import BUILT_IN, filter_module
 from detectors.interface import Calibratable
 from harness.evaluation.study.record import BoardDesign
-from harness.experiment.schema import Experiment, Point, SimulatedSource, StudyConfig
+from harness.experiment.schema import (
+    AnyReference,
+    Experiment,
+    GoodPartsReference,
+    Point,
+    ScanReference,
+    SimulatedSource,
+    StudyConfig,
+)
 from harness.experiment.unfold import source_of
 from harness.records.rows import Role
 from harness.runs.journal import JOURNAL_VERSION
@@ -29,6 +37,7 @@ from harness.trials.board import BoardRef
 from harness.trials.clouds import TrialPoint
 from harness.trials.judge import Criteria, detector_of
 from harness.trials.learning import LEARNING_BOARDS
+from harness.trials.references import NO_REFERENCES, ReferenceBoards
 from harness.trials.trial import Trial
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
@@ -90,18 +99,27 @@ class Batch:
     role: Role
     """Purpose of the target."""
     renders: tuple[RenderJob, ...]
-    """A render for each view; in the role "learning", those of all targets in sequence."""
+    """A render for each view, then those of references; in the role "learning", those of all
+    targets in sequence."""
     views: tuple[BoardRef, ...]
     """The board in each of these views."""
     board: int | None = None
     """The board's number in a study; None for other experiments."""
     units: tuple[CameraConfig, ...] = ()
     """Cameras that take turns over the repeats; empty: the camera of the views."""
+    references: ReferenceBoards = NO_REFERENCES
+    """What the board may be compared with."""
 
     @cached_property
     def paths(self) -> tuple[Path, ...]:
         """The files of its views."""
         return tuple(job.path for job in self.renders)
+
+    def references_before(self, repeat: int) -> ReferenceBoards:
+        """Return the boards of references before the camera of a repeat."""
+        if not self.units:
+            return self.references
+        return self.references.before(self.units[repeat % len(self.units)])
 
     def before(self, repeat: int) -> tuple[BoardRef, ...]:
         """Return the board in each view before the camera of a repeat."""
@@ -147,7 +165,7 @@ class Group:
         """The points whose detector learns."""
         learners = []
         for point in self.points:
-            settings = canonical_json(point.config.detector.settings)
+            settings = canonical_json(point.config.detector_settings)
             if isinstance(detector_of(point.config.detector.name, settings), Calibratable):
                 learners.append(point)
         return tuple(learners)
@@ -227,6 +245,7 @@ class Group:
                 points=judging,
                 poses=self.poses,
                 board=batch.board,
+                references=batch.references_before(repeat),
             )
             yield self._key(batch, trial), trial
 
@@ -243,6 +262,7 @@ class Group:
                 repeat=0,
                 points=(trial_point(self.learners[number], None, None),),
                 poses=self.poses,
+                references=batch.references,
             )
             yield self._key(batch, trial), trial
 
@@ -304,13 +324,14 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
         averaging=averaging,
         criteria=Criteria(
             detector=config.detector.name,
-            settings_json=canonical_json(config.detector.settings),
+            settings_json=canonical_json(config.detector_settings),
             threshold=threshold,
             radius_m=config.matching.radius_mm * MM,
             overlap=config.matching.overlap,
             learned=learned,
         ),
         mapping=config.mapping,
+        reference=config.reference,
     )
 
 
@@ -402,7 +423,7 @@ def _group(
     config = points[0].config
     source = config.simulated
     if config.study is not None and isinstance(source.target, DrawnTargetConfig):
-        boards = _StudyBoards(points[0], config.study, cache, design)
+        boards = _StudyBoards(points, config.study, cache, design)
         calibrate = config.threshold.calibrate
         calibrating = 0 if calibrate is None else calibrate.boards or 0
         learning = boards.batches("learning", LEARNING_BOARDS)
@@ -439,18 +460,23 @@ def _joined(role: Role, batches: Sequence[Batch]) -> Batch:
     """Return one batch whose trials need the views of several."""
     renders = {}
     views: list[BoardRef] = []
+    earlier: list[BoardRef] = []
     for batch in batches:
         renders.update({job.path: job for job in batch.renders})
         views += batch.before(0)
-    return Batch(role, tuple(renders.values()), tuple(views))
+        earlier += batch.references_before(0).earlier
+    good_parts = batches[0].references_before(0).good_parts
+    references = ReferenceBoards(tuple(earlier), good_parts)
+    return Batch(role, tuple(renders.values()), tuple(views), references=references)
 
 
 @dataclass(frozen=True)
 class _StudyBoards:
     """Makes the batches of a study: one for each board."""
 
-    point: Point
-    """The family of boards, the camera, and the unknowns that are drawn for each board."""
+    points: tuple[Point, ...]
+    """They share the family of boards, the camera, and the unknowns that are drawn for each board;
+    each may have a reference of its own."""
     study: StudyConfig
     """The number of units of the camera."""
     cache: Path
@@ -462,14 +488,39 @@ class _StudyBoards:
         """Return the batches of a role's first ``count`` boards."""
         batches = []
         for board in range(count):
-            source = source_of(self.point, role, board)
+            source = source_of(self.points[0], role, board)
             assert isinstance(source.target, DrawnTargetConfig)
             chosen_mm = None
             if self.design is not None and role == "damaged":
                 chosen_mm = self.design.sizes_mm(board)
             target = _drawn(source.target, role, board, chosen_mm)
             units = self._units(source.camera, role, board)
-            batches.append(batch_of(target, role, source, self.cache, board, units))
+            batch = batch_of(target, role, source, self.cache, board, units)
+            earlier = []
+            if any(isinstance(reference, ScanReference) for reference in self._references):
+                pose = source.target.earlier_pose(role, board)
+                placed = target.model_copy(update={"pose": pose})
+                earlier.append(batch_of(placed, "hole_free", source, self.cache))
+            batches.append(_with_references(batch, earlier, self._good_parts))
+        return batches
+
+    @property
+    def _references(self) -> list[AnyReference | None]:
+        return [point.config.reference for point in self.points]
+
+    @cached_property
+    def _good_parts(self) -> list[Batch]:
+        """The good parts, as many as any point compares with."""
+        counts = [0]
+        for reference in self._references:
+            if isinstance(reference, GoodPartsReference):
+                counts.append(reference.parts)
+        batches = []
+        for number in range(max(counts)):
+            source = source_of(self.points[0], "good_part", number)
+            assert isinstance(source.target, DrawnTargetConfig)
+            part = _drawn(source.target, "good_part", number)
+            batches.append(batch_of(part, "hole_free", source, self.cache))
         return batches
 
     def _units(self, camera: CameraConfig, role: Role, board: int) -> tuple[CameraConfig, ...]:
@@ -479,8 +530,20 @@ class _StudyBoards:
         if not self.study.units or (calibrates and self.study.one_unit_calibrates):
             return ()
         numbers = range(self.study.units) if role == "damaged" else [board]
-        seed = self.point.config.seed
+        seed = self.points[0].config.seed
         return tuple(unit_of(camera, seed, role, number) for number in numbers)
+
+
+def _with_references(batch: Batch, earlier: Sequence[Batch], good_parts: Sequence[Batch]) -> Batch:
+    """Return a batch with the boards that its own is compared with."""
+    renders = list(batch.renders)
+    for shown in (*earlier, *good_parts):
+        renders += shown.renders
+    references = ReferenceBoards(
+        earlier=tuple(view for shown in earlier for view in shown.views),
+        good_parts=tuple(view for shown in good_parts for view in shown.views),
+    )
+    return replace(batch, renders=tuple(renders), references=references)
 
 
 # cameras, frames and detectors share boards

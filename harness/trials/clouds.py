@@ -7,19 +7,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from detectors.crop import AnyCrop, NoCrop
 from detectors.views.mapping.merge import Merged, merge, prepare
 from detectors.views.mapping.settings import MappingConfig
 from detectors.views.registration.register import register
 from detectors.views.registration.registered import Registration, predicted_error_m
 from detectors.views.registration.settings import PAIRWISE
 from detectors.views.view import PreparedView, View
+from harness.experiment.schema import AnyReference
 from harness.records.rows import NoiseRow, Origin, ProbesRow, RegistrationRow, Role
 from harness.trials.averages import Averaging
 from harness.trials.board import Board, LabelledCloud, face_errors_m
-from harness.trials.judge import Criteria
+from harness.trials.judge import Criteria, detector_of
+from harness.trials.references import Recorded, ReferenceBoards, compared
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
 from harness.vocabulary.seeds import canonical_json
 from scenes.perspectives import AnyViews, T_reference_view_of, guessed_T_reference_view
@@ -48,6 +52,8 @@ class TrialPoint:
     """The detector that judges the cloud, its threshold, and what counts as a hit."""
     mapping: MappingConfig | None = None
     """Registration and merge of the clouds of several views; None for a single view."""
+    reference: AnyReference | None = None
+    """What the cloud is compared with; None: a surface that is fitted to it."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +78,40 @@ class ViewClouds:
     """Clouds by number of frames."""
     first_frames: SimulatedCapture
     """The first `NOISE_FRAMES` frames, whose difference is noise."""
+    seed: int
+    """Seed of the noise."""
+    labels: tuple[str | int, ...]
+    """Labels of the random stream."""
+    references: ReferenceBoards
+    """What the board may be compared with."""
+    _compared: dict[str, Cloud] = field(default_factory=dict)
 
     def key(self, point: TrialPoint) -> str:
         """Return a text that is equal for points that see the same cloud."""
-        return str(point.frames)
+        if point.reference is None:
+            return str(point.frames)
+        return canonical_json([point.frames, point.reference.to_data(), _crop(point).to_data()])
 
     def cloud(self, point: TrialPoint) -> Cloud:
         """Return what a detector sees."""
-        return self.averages[point.frames]
+        average = self.averages[point.frames]
+        if point.reference is None:
+            return average
+        key = self.key(point)
+        if key not in self._compared:
+            self._compared[key] = compared(
+                average,
+                self.board.target.board,
+                point.reference,
+                boards=self.references,
+                recorded=Recorded(point.frames, point.averaging, _crop(point), self.seed),
+                labels=self.labels,
+            )
+        return self._compared[key]
 
     def labelled(self, point: TrialPoint) -> LabelledCloud:
         """Return the cloud with the truth."""
-        return self.board.labelled(self.averages[point.frames])
+        return self.board.labelled(self.cloud(point))
 
     def probes_row(self, point: TrialPoint, origin: Origin) -> ProbesRow:
         """Return the errors of z at the board's probes."""
@@ -121,6 +149,13 @@ class ViewClouds:
     ) -> list[RegistrationRow]:
         """Return no rows: a single view is not registered."""
         return []
+
+
+def _crop(point: TrialPoint) -> AnyCrop:
+    """Return how a point's detector, which has a surface, cuts out the board."""
+    detector: Any = detector_of(point.criteria.detector, point.criteria.settings_json)
+    crop: AnyCrop = getattr(detector.settings, "crop", NoCrop())
+    return crop
 
 
 @dataclass

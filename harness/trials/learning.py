@@ -28,7 +28,10 @@ def learn(trial: Trial) -> dict[str, list[dict[str, Any]]]:
     clouds = []
     for number in range(LEARNING_BOARDS):
         own_views = trial.views[number * views : (number + 1) * views]
-        clouds.append(cloud_of(replace(trial, views=own_views, repeat=number), point))
+        earlier = trial.references.earlier[number : number + 1]
+        own_references = replace(trial.references, earlier=earlier)
+        own = replace(trial, views=own_views, references=own_references, repeat=number)
+        clouds.append(cloud_of(own, point))
     detector = detector_of(point.criteria.detector, point.criteria.settings_json)
     if not isinstance(detector, Calibratable):
         raise TypeError(f"the detector {point.criteria.detector!r} does not learn")

@@ -17,6 +17,7 @@ from harness.trials.board import Board, BoardRef, load_board
 from harness.trials.clouds import NOISE_FRAMES, MapClouds, TrialPoint, ViewClouds
 from harness.trials.judge import Criteria, Judgement, judge
 from harness.trials.record import add_judgement
+from harness.trials.references import NO_REFERENCES, ReferenceBoards
 from harness.vocabulary.geometry import Cloud
 from scenes.perspectives import AnyViews
 from scenes.sensor.source import SimulatedCapture
@@ -40,6 +41,8 @@ class Trial:
     """Declaration of several views; None for a single view."""
     board: int | None = None
     """Number of the board in a study; None outside studies."""
+    references: ReferenceBoards = NO_REFERENCES
+    """What the board may be compared with."""
 
     @property
     def hole_free(self) -> bool:
@@ -127,7 +130,19 @@ def clouds_of(
     """Return what points see of averages by view and number of frames."""
     if trial.poses is not None:
         return MapClouds(boards, averages, trial.poses, trial.labels)
-    return ViewClouds(boards[0], averages[0], capture_of(trial, 0, boards[0], NOISE_FRAMES))
+    return view_clouds(trial, boards[0], averages[0])
+
+
+def view_clouds(trial: Trial, board: Board, averages: Mapping[int, Cloud]) -> ViewClouds:
+    """Return what points see of a single view's averages by number of frames."""
+    return ViewClouds(
+        board=board,
+        averages=averages,
+        first_frames=capture_of(trial, 0, board, NOISE_FRAMES),
+        seed=trial.seed,
+        labels=trial.labels,
+        references=trial.references,
+    )
 
 
 def uses_view(point: TrialPoint, number: int) -> bool:

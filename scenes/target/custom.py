@@ -158,6 +158,30 @@ class MeshConfig(_FileConfig):
     front: FrontAxis = "+z"
 
 
+DrawnShapeConfig = Annotated[
+    FlatConfig | CylinderConfig | SphereConfig | PolynomialConfig | CorrugatedConfig | PanelConfig,
+    Field(discriminator="kind"),
+]
+
+
+class MadeConfig(Config):
+    """A face as it was made, which differs from its drawing, each part in its own way: the sizes
+    of the shape, and a smooth error of form (Legendre polynomials of degree 2 and 3 in both
+    directions, with equal variances)."""
+
+    kind: Literal["made"]
+    shape: DrawnShapeConfig = Field(description="the drawing's")
+    form_mm: Annotated[float, Field(ge=0.0, le=20.0)] = Field(
+        0.3, description="standard deviation of the error of form"
+    )
+    sizes_percent: Annotated[float, Field(ge=0.0, le=20.0)] = Field(
+        1.0, description="standard deviation of each size of the shape"
+    )
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = Field(
+        1, description="a family of boards draws it for each board"
+    )
+
+
 ShapeConfig = Annotated[
     FlatConfig
     | CylinderConfig
@@ -166,6 +190,7 @@ ShapeConfig = Annotated[
     | CorrugatedConfig
     | PanelConfig
     | RoughConfig
+    | MadeConfig
     | MeshConfig,
     Field(discriminator="kind", default_factory=FlatConfig),
 ]
@@ -179,6 +204,13 @@ class BoardConfig(Config):
     height_mm: Annotated[float, Field(ge=5.0, le=5e3)]
     thickness_mm: Annotated[float, Field(ge=0.5, le=500.0)]
     shape: ShapeConfig
+
+    @property
+    def as_drawn(self) -> BoardConfig:
+        """The board of the drawing, from which a made one differs."""
+        if not isinstance(self.shape, MadeConfig):
+            return self
+        return self.model_copy(update={"shape": self.shape.shape})
 
 
 class DamageConfig(PlacedConfig):

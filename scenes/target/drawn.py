@@ -42,7 +42,7 @@ from scenes.target.truth import (
 )
 
 # purposes of boards; no two share boards
-Purpose = Literal["learning", "calibration", "hole_free", "damaged"]
+Purpose = Literal["learning", "calibration", "hole_free", "damaged", "good_part"]
 # limits of a pose's distance, jitter included
 NEAREST_M = 0.1
 FARTHEST_M = 10.0
@@ -379,10 +379,7 @@ class DrawnTargetConfig(Config):
 
         ``chosen_mm``: ascending sizes (``damage.limit_of``), which replace those that would be
         drawn; all else of the board is as without."""
-
-        def stream(quantity: str) -> np.random.Generator:
-            return random_stream(self.seed, "drawn board", purpose, number, quantity)
-
+        stream = self._stream(purpose, number)
         damages = self._damages(stream, chosen_mm)
         field = "flaws"
         if not isinstance(self.damage, DrawnFlaws):
@@ -480,13 +477,26 @@ class DrawnTargetConfig(Config):
         return custom.HoleConfig(**facts, kind=damage.kind, chamfer_mm=damage.chamfer_mm)
 
     def _board(self, stream: Stream) -> custom.BoardConfig:
-        """Return the board; each has roughness of its own."""
+        """Return the board; each has roughness, or an error of form, of its own."""
         shape = self.board.shape
-        if not isinstance(shape, custom.RoughConfig):
+        if not isinstance(shape, custom.RoughConfig | custom.MadeConfig):
             return self.board
         seed = int(stream("roughness").integers(2**32))
-        rough = shape.model_copy(update={"seed": seed})
-        return self.board.model_copy(update={"shape": rough})
+        own = shape.model_copy(update={"seed": seed})
+        return self.board.model_copy(update={"shape": own})
+
+    def earlier_pose(self, purpose: Purpose, number: int) -> custom.PoseConfig:
+        """Return the pose in which a board was recorded before it was damaged."""
+        return self._pose(self._stream(purpose, number, "earlier "))
+
+    def _stream(self, purpose: Purpose, number: int, prefix: str = "") -> Stream:
+        """Return the random numbers of a board's quantities, whose names begin with ``prefix``."""
+
+        def stream(quantity: str) -> np.random.Generator:
+            name = f"{prefix}{quantity}"
+            return random_stream(self.seed, "drawn board", purpose, number, name)
+
+        return stream
 
     def _pose(self, stream: Stream) -> custom.PoseConfig:
         """Draw the pose."""

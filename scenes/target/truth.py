@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import polynomial
+from numpy.polynomial import legendre, polynomial
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
@@ -120,6 +120,8 @@ def face_of(board: custom.BoardConfig) -> Face:
     """Return the face that a board's declaration describes."""
     shape = board.shape
     size_m = (board.width_mm * MM, board.height_mm * MM)
+    if isinstance(shape, custom.MadeConfig):
+        return _made_face(board, shape, size_m)
     if isinstance(shape, custom.RoughConfig):
         return _rough_face(shape, size_m)
     if isinstance(shape, custom.MeshConfig):
@@ -180,6 +182,46 @@ def _panel_face(shape: custom.PanelConfig) -> Face:
     return Face(panel)
 
 
+FORM_ORDERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Degrees in x and y of the Legendre polynomials of an error of form: lower ones move a part."""
+
+
+def _made_face(
+    board: custom.BoardConfig, shape: custom.MadeConfig, size_m: tuple[float, float]
+) -> Face:
+    """Return the drawing's face with other sizes and an error of form, both drawn by the seed."""
+    sizes = {}
+    for name, value in shape.shape:
+        if name.endswith("_mm") and isinstance(value, float):
+            spread = random_stream(shape.seed, "made", name).standard_normal()
+            sizes[name] = value * (1.0 + shape.sizes_percent / 100 * spread)
+    varied = shape.shape.model_copy(update=sizes)
+    drawn = face_of(board.model_copy(update={"shape": varied}))
+    numbers = random_stream(shape.seed, "made", "form").standard_normal(len(FORM_ORDERS))
+    terms = np.zeros((4, 4))
+    for (order_x, order_y), number in zip(FORM_ORDERS, numbers, strict=True):
+        in_x = _legendre(order_x, size_m[0])
+        in_y = _legendre(order_y, size_m[1])
+        amplitude_m = shape.form_mm * MM * number / math.sqrt(len(FORM_ORDERS))
+        terms[: order_x + 1, : order_y + 1] += amplitude_m * np.outer(in_x, in_y)
+    terms[0, 0] = 0.0
+    form = _polynomial(terms)
+
+    def made(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        pairs = zip(drawn.derivatives(x, y), form.derivatives(x, y), strict=True)
+        return tuple(of_drawn + of_form for of_drawn, of_form in pairs)
+
+    return Face(made)
+
+
+def _legendre(order: int, side_m: float) -> np.ndarray:
+    """Return the coefficients (order + 1,) of a Legendre polynomial over a side, of mean square
+    1."""
+    coefficients = legendre.leg2poly([0.0] * order + [1.0])
+    powers = np.arange(order + 1)
+    return np.asarray(coefficients * math.sqrt(2 * order + 1) / (side_m / 2) ** powers)
+
+
 def _round_face(shape: custom.CylinderConfig | custom.SphereConfig) -> Face:
     """Return the face with z = +-(sqrt(R^2 - x^2 - y^2) - R), of a cylinder without the direction
     along which it is straight."""
@@ -217,6 +259,11 @@ def _polynomial_face(
     for term in shape.terms:
         scale = MM / half_x**term.power_x / half_y**term.power_y
         coefficients[term.power_x, term.power_y] += term.coefficient_mm * scale
+    return _polynomial(coefficients)
+
+
+def _polynomial(coefficients: np.ndarray) -> Face:
+    """Return the face whose height is a polynomial: coefficients (a, b) of x^a y^b, metres."""
     if not coefficients.any():
         return Face(_flat)
     derived = []

@@ -39,14 +39,14 @@ class Decided:
     @property
     def is_wrong(self) -> bool:
         """Whether it accepts a part beyond the tolerance, or rejects one within it."""
-        is_within = self.true_mm <= TOLERANCE.limit_mm
+        is_within = self.true_mm <= TOLERANCE.limit
         return self.decision == (FAILS if is_within else CONFORMS)
 
 
 def decided_on(number: int, reference: PartScan | None) -> Decided:
     """Decide on part ``number``, against a good part or a smooth surface."""
     rng = np.random.default_rng([42, number])
-    true_mm = float(rng.uniform(0.5, 1.5) * TOLERANCE.limit_mm)
+    true_mm = float(rng.uniform(0.5, 1.5) * TOLERANCE.limit)
     x_mm, y_mm = PLACES_MM[number % len(PLACES_MM)]
     dent = Dent(x_mm, y_mm, float(rng.uniform(11, 16)), true_mm)
     part = MadePart((dent,), has_ribs=reference is not None)
@@ -75,7 +75,7 @@ def reported(name: str, decisions: Sequence[Decided]) -> None:
     """Print the shares of wrong decisions, with their 95 % intervals, and all decisions."""
     print(f"compared with {name}: {len(decisions)} parts")
     for beyond, kind in ((True, "accepted beyond the tolerance"), (False, "rejected within it")):
-        group = [each for each in decisions if (each.true_mm > TOLERANCE.limit_mm) == beyond]
+        group = [each for each in decisions if (each.true_mm > TOLERANCE.limit) == beyond]
         wrong = sum(each.is_wrong for each in group)
         low, high = intervals.wilson(wrong, len(group))
         print(f"  {kind}: {wrong} of {len(group)} ({100 * low:.1f} to {100 * high:.1f} %)")

@@ -24,7 +24,7 @@ from harness.inspection.tolerance import (
     PartDecision,
     Tolerance,
     _doubt,
-    combined_mm,
+    combined,
     decided,
     tolerances_from,
 )
@@ -51,12 +51,12 @@ def at_both(hits: int) -> Missed:
 )
 def test_the_guard_band_is_1_645_standard_uncertainties(value_mm: float, decision: str) -> None:
     assert pytest.approx(1.645, abs=1e-3) == GUARD
-    assert decided(value_mm, 0.1, 0.5) == decision
+    assert decided(value_mm, GUARD * 0.1, 0.5) == decision
 
 
 def test_a_size_at_the_limit_is_decided_wrongly_as_often_as_stated() -> None:
     measured_mm = 0.5 + 0.1 * np.random.default_rng(1).standard_normal(4000)
-    decisions = [decided(value_mm, 0.1, 0.5) for value_mm in measured_mm]
+    decisions = [decided(value_mm, GUARD * 0.1, 0.5) for value_mm in measured_mm]
     for wrong in (CONFORMS, FAILS):
         assert decisions.count(wrong) / 4000 == pytest.approx(0.05, abs=0.011)
 
@@ -66,17 +66,17 @@ def on(number: int, decision: str) -> FindingDecision:
     return FindingDecision(
         id=number,
         kind="depth",
-        value_mm=0.6,
+        value=0.6,
         contributions=parts,
-        uncertainty_mm=combined_mm(parts),
+        uncertainty=combined(parts),
         decision=decision,
         reason="",
     )
 
 
 def test_contributions_add_as_squares() -> None:
-    assert on(1, FAILS).uncertainty_mm == pytest.approx(0.05)
-    assert math.isnan(combined_mm(()))
+    assert on(1, FAILS).uncertainty == pytest.approx(0.05)
+    assert math.isnan(combined(()))
 
 
 @pytest.mark.parametrize(
@@ -120,14 +120,20 @@ def test_doubts_about_a_decision() -> None:
 
 
 def test_tolerances_are_stated_with_units() -> None:
-    assert tolerances_from(["depth=0.5mm", "width=1cm"]) == (DEPTH, Tolerance("width", 10.0))
-    for text, message in (("depth", "no tolerance"), ("volume=1mm", "no tolerance")):
+    texts = ["depth=0.5mm", "width=1cm", "volume=0.5cm3", "deviation=1mm"]
+    expected = (DEPTH, Tolerance("width", 10.0), Tolerance("volume", 500.0))
+    assert tolerances_from(texts[:3], has_drawing=False) == expected
+    assert tolerances_from(texts, has_drawing=True)[3] == Tolerance("deviation", 1.0)
+    for wrong, message in (
+        (["depth"], "no tolerance"),
+        (["area=1mm"], "no tolerance"),
+        (["volume=1mm"], "not a volume with a unit"),
+        (["depth=0.5"], "not a length with a unit"),
+        (["depth=1mm", "depth=2mm"], "stated twice"),
+        (["deviation=1mm"], "without a drawing"),
+    ):
         with pytest.raises(UserError, match=message):
-            tolerances_from([text])
-    with pytest.raises(UserError, match="not a length with a unit"):
-        tolerances_from(["depth=0.5"])
-    with pytest.raises(UserError, match="stated twice"):
-        tolerances_from(["depth=1mm", "depth=2mm"])
+            tolerances_from(wrong, has_drawing=False)
 
 
 def test_few_simulated_parts_are_decided_wrongly() -> None:
@@ -170,4 +176,11 @@ def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> No
     assert (missed["at_both"]["diameter_mm"], missed["at_both"]["depth_mm"]) == (12.0, 0.5)
     assert missed["at_both"]["hits"] == missed["at_both"]["places"] >= 20
     assert "a dent 0.5 mm deep and 12 mm wide is found with probability 1.00" in missed["text"]
-    assert "Within tolerance?" in page and "ISO 14253-1" in page and "signature" in page
+    assert "Within tolerance?" in page and "ISO 14253-1" in page
+    sheets = (tmp_path / "out" / "decision.html").read_text()
+    for text in ("signature", "Evidence", "registration", "SHA-256", "detector local"):
+        assert text in sheets
+    stated = json.loads((tmp_path / "out" / "decision.json").read_text())
+    assert stated["decision"] == FAILS
+    assert stated["reference"] == str(tmp_path / "then")
+    assert stated["findings"] == tolerance["findings"]

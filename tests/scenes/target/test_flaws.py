@@ -188,6 +188,7 @@ SHAPES = (
     {"kind": "corrugated", "straight_along": "x"},
     {"kind": "panel"},
     {"kind": "rough"},
+    {"kind": "made", "shape": {"kind": "panel"}, "form_mm": 1.0, "sizes_percent": 5.0},
 )
 
 
@@ -209,6 +210,28 @@ def test_derivatives_of_faces_are_those_of_their_heights(shape: dict[str, Any]) 
         face.bend(x, y), np.transpose(bends), atol=0.5 if shape["kind"] == "rough" else 1e-3
     )
     assert abs(float(face.height_m(0.0, 0.0))) < 1e-12
+
+
+def test_made_boards_differ_from_the_drawing_as_declared() -> None:
+    x, y = np.meshgrid(np.linspace(-0.15, 0.15, 61), np.linspace(-0.1, 0.1, 41))
+    plane = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    deviations = []
+    for seed in range(60):
+        shape = {"kind": "made", "shape": {"kind": "flat"}, "form_mm": 0.5, "seed": seed}
+        board = target(board={**BOARD, "shape": shape}).board
+        assert board.as_drawn.shape.kind == "flat"
+        form_m = face_of(board).height_m(x, y).ravel()
+        form_m = form_m - plane @ np.linalg.lstsq(plane, form_m, rcond=None)[0]
+        deviations.append(np.mean(form_m**2))
+    # of 60 x 7 random amplitudes: 3.5 %
+    assert np.sqrt(np.mean(deviations)) == pytest.approx(0.5e-3, rel=0.1)
+    steps = []
+    for seed in range(60):
+        panel = {"kind": "panel", "radius_x_mm": 1e6, "radius_y_mm": 1e6}
+        shape = {"kind": "made", "shape": panel, "form_mm": 0.0, "sizes_percent": 5.0, "seed": seed}
+        face = face_of(target(board={**BOARD, "shape": shape}).board)
+        steps.append(float(face.height_m(0.0, 0.1) - face.height_m(0.0, -0.1)))
+    assert np.std(steps) / np.mean(steps) == pytest.approx(0.05, rel=0.35)
 
 
 def test_a_rough_board_has_its_deviation_and_every_board_its_own_face() -> None:

@@ -1,0 +1,129 @@
+"""Two sheets to print and sign: the decision on the tolerances, and its evidence; as a page and as
+data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup
+
+from harness.inspection import output
+from harness.inspection.tolerance import (
+    DECISIONS,
+    GUARD,
+    KINDS,
+    RISK,
+    FindingDecision,
+    PartDecision,
+)
+from harness.report.blocks import joined, paragraph, template
+from harness.report.findings import Judged
+from harness.report.inspection_page import best_view, definitions, numbered_picture
+from harness.vocabulary.text import Grid
+
+HEADS = ("place", "decision", "why", "tolerance", "measured", "uncertainty", "guard band")
+MOST_ROWS = 24
+"""Most decisions on the first sheet."""
+MOST_COLUMNS = 6
+"""Most decisions whose uncertainties the second sheet divides."""
+SIGNED = ("decided by", "date", "signature")
+"""What is filled in by hand."""
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """A decision with what it is signed for."""
+
+    decision: PartDecision
+    about: Sequence[tuple[str, str]]
+    """Part, reference, conditions and version: names and values."""
+    files: Sequence[Mapping[str, str]]
+    """The files that were read, with their digests."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Return it as plain data, for the JSON."""
+        return {**dict(self.about), **self.decision.facts, "files": list(self.files)}
+
+    def html(self, result: Judged) -> str:
+        """Return the page as text; it needs no network."""
+        name, view = best_view(result)
+        limits = " and ".join(tolerance.text for tolerance in self.decision.tolerances)
+        about = [*self.about[:2], ("tolerance", limits), *self.about[2:]]
+        digests = [(entry["path"], f"SHA-256 {entry['sha256']}") for entry in self.files]
+        missed = self.decision.missed.text
+        return template("decision.html").render(
+            title=f"Decision on {self.about[0][1]}",
+            answer=f"{self.decision.short}.",
+            about=definitions(about),
+            decisions=decisions_table(self.decision),
+            rule=rule_text(),
+            signature=definitions((name, "") for name in SIGNED),
+            picture=numbered_picture(result, view, name),
+            missed=f"{missed[0].upper()}{missed[1:]}.",
+            budget=_budget(self.decision),
+            files=definitions(digests),
+        )
+
+
+def _worst_first(decision: PartDecision) -> list[FindingDecision]:
+    return sorted(decision.findings, key=lambda entry: DECISIONS.index(entry.decision))
+
+
+def decisions_table(decision: PartDecision) -> Markup:
+    """Return each decision with its size, uncertainty and guard band, the worst first."""
+    limits = {tolerance.kind: tolerance.limit for tolerance in decision.tolerances}
+    entries = _worst_first(decision)
+    rows = []
+    for entry in entries[:MOST_ROWS]:
+        unit = KINDS[entry.kind]
+        rows.append(
+            (
+                entry.place,
+                entry.decision,
+                entry.reason,
+                f"{entry.kind} {limits[entry.kind]:g} {unit}",
+                f"{output.number(entry.value, 2)} {unit}",
+                output.number(entry.uncertainty, 2),
+                output.number(entry.guard, 2),
+            )
+        )
+    if not rows:
+        return Markup("")
+    parts = [Grid.of(HEADS, rows, left=4).html()]
+    further = len(entries) - MOST_ROWS
+    if further > 0:
+        parts.append(paragraph(f"{further} more are in decision.json."))
+    return joined(parts)
+
+
+def rule_text() -> str:
+    """Return the rule of the decisions in words."""
+    risk = f"{100 * RISK:g} %"
+    return (
+        "A size conforms if it lies below the limit by the guard band, and does not conform if it"
+        f" lies above the limit by it (ISO 14253-1); the band is {GUARD:.3g} standard"
+        f" uncertainties, so that at most {risk} of sizes at the limit are accepted and at most"
+        f" {risk} are rejected."
+    )
+
+
+def _budget(decision: PartDecision) -> Markup:
+    """Return each contribution to the uncertainties."""
+    entries = _worst_first(decision)[:MOST_COLUMNS]
+    names: list[str] = []
+    for entry in entries:
+        names += [part.name for part in entry.contributions if part.name not in names]
+    rows = []
+    for name in names:
+        row = [name]
+        for entry in entries:
+            sizes = {part.name: part.size for part in entry.contributions}
+            row.append(f"{sizes[name]:.3f}" if name in sizes else "-")
+        rows.append(row)
+    if not rows:
+        return Markup("")
+    heads = [f"{entry.place}: {entry.kind} ({KINDS[entry.kind]})" for entry in entries]
+    return Grid.of(("standard uncertainty from", *heads), rows, left=1).html()
