@@ -259,9 +259,7 @@ def _image(
     norm: SymLogNorm,
 ) -> AxesImage:
     """Draw residuals (h, w) with a dot on each pixel of a finding."""
-    from matplotlib.colors import to_hex
-
-    axes.set_facecolor(to_hex([level / 255 for level in UNJUDGED_RGB]))
+    axes.set_facecolor("#" + bytes(UNJUDGED_RGB).hex())
     axes.grid(visible=False)
     picture = axes.imshow(residual_mm, norm=norm, cmap="RdBu_r", aspect="equal")
     v, u = np.nonzero(detected)

@@ -84,7 +84,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     " with how many frames, from a stored table of limits of simulated set-ups (tofpod atlas),"
     " with intervals. Nothing is extrapolated.",
     "tofpod ask --damage hole --size 5mm --distance 1m",
-    "tofpod ask --damage dent --depth 1mm --distance 0.5m --camera 'femto bolt' --camera l515"
+    "tofpod ask --damage dent --depth 1mm --distance 1m --camera femto_bolt_nfov --camera pmd_flexx2"
     " --out compared",
 )
 def main(options: argparse.Namespace, command: str) -> int:

@@ -111,5 +111,8 @@ DETECTOR = Program(
     description="Write a detector's scores on the boards of a data set as anomaly maps, which "
     "tofpod score judges beside those of any other method. Detectors that learn do so on the "
     "good boards of train.",
-    epilog="example: tofpod score detector matched --dataset boards --out maps/matched",
+    examples=(
+        "tofpod score detector matched --dataset boards --out maps/matched",
+        "tofpod score detector thesis --dataset boards --out maps/thesis",
+    ),
 )

@@ -189,5 +189,8 @@ RANK = Program(
     run=_run,
     description="Rank methods that tofpod score judged on the same data set by a90, with AU-PRO "
     f"and AUROC beside it. Write {PAGE} and a table.",
-    epilog="example: tofpod score rank scores/thesis scores/matched scores/mine",
+    examples=(
+        "tofpod score rank scores/thesis scores/matched",
+        "tofpod score rank scores/thesis scores/matched scores/mine --out ranking",
+    ),
 )

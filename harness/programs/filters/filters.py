@@ -58,7 +58,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "false calls with the threshold of no filter, and the bias of diameters and depths. All "
     "filters act on the same frames of the same boards, and each has a threshold with equal "
     f"false calls. Write {FILTERS_PAGE.name} and tables to the study's folder.",
-    epilog="Finished trials are kept. example: tofpod filters --filter median --quick",
+    "tofpod filters --quick",
+    "tofpod filters --filter median --quick",
+    epilog="Finished trials are kept.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if trials failed, 2 for a user's mistake, 130 after Ctrl-C."""
