@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ class Ranked:
     """1 for the smallest a90; methods without a limit come last."""
     limit: SetUpLimit
     """Its detection limit."""
-    areas: dict[str, Any]
+    areas: Mapping[Any, Any]
     """Its areas under curves: the row of ``scores.csv``."""
 
 
