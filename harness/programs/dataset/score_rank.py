@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from harness.records.schema import Table
 
 PAGE = "leaderboard.html"
-OWN = (
-    "Add a method: write its maps for all boards of validation and test, run `tofpod score MAPS "
-    "--dataset DIR --name NAME --out scores/NAME`, then this command with that folder. A detector "
-    "of your package writes its maps by `tofpod score detector NAME`."
-)
+OWN = """\
+# a detector of your package writes its maps; any other method writes them itself
+tofpod score detector NAME --dataset DIR --out maps/NAME
+tofpod score maps/NAME --dataset DIR --name NAME --out scores/NAME
+tofpod score rank scores/*"""
+"""How to add a method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class Ranked:
     """1 for the smallest a90; methods without a limit come last."""
     limit: SetUpLimit
     """Its detection limit."""
-    areas: dict[str, Any]
+    areas: Mapping[Any, Any]
     """Its areas under curves: the row of ``scores.csv``."""
 
 
@@ -158,8 +159,9 @@ def answer(rows: Sequence[Ranked]) -> str:
 
 def leaderboard_html(rows: Sequence[Ranked], command: str) -> str:
     """Return the page as text; it needs no network."""
-    from harness.report.blocks import command_of, figure, heading, note, page
+    from harness.report.blocks import command_of, figure, heading, note, page, subheading, tag
     from harness.report.limits_figure import limits_figure
+    from harness.vocabulary.text import many
 
     caption = "a90 with its 95 % interval over boards, and a90/95 (bar), by method."
     limits = [
@@ -170,11 +172,12 @@ def leaderboard_html(rows: Sequence[Ranked], command: str) -> str:
         drawn,
         heading("Methods"),
         leaderboard().grid(rows).html(),
-        note(OWN),
+        subheading("Add a method"),
+        tag("pre", OWN),
         *command_of(command),
     ]
     boards = rows[0].limit.boards
-    conditions = f"{len(rows)} rows; {boards} damaged boards in the first category."
+    conditions = f"Maps of {many(boards, 'damaged board')} in the first category, judged by a90."
     return page("Leaderboard", answer(rows), body, [note(conditions)])
 
 
