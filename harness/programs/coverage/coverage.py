@@ -104,7 +104,7 @@ def _pose(text: str) -> Pose:
     "distance and missing returns there, and the share of the part on which a wanted size "
     "is found. Write tables and a "
     "page on which the part can be turned.",
-    "tofpod coverage pipe --size 3mm --suggest 2",
+    "tofpod coverage pipe --detector thesis --size 3mm --suggest 2",
     "tofpod coverage pipe --goal 3mm --share 0.9",
 )
 def main(options: argparse.Namespace, command: str) -> int:
