@@ -16,7 +16,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a YAML file, or the name of one that comes with tofpod, such as averaging",
     )
     help = (
-        "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be "
+        "change a value of the file, such as repeats=5 or source.target.distance_m=90cm; may be "
         "repeated"
     )
     add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=help)

@@ -80,7 +80,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "more, in any format that tofpod detect reads, in order of time. Captures at several "
     "distances, with the camera moved sideways by 30 mm or more, show the most.",
     "tofpod characterise captures/near captures/far --like azure_kinect_nfov --out my_camera",
-    "tofpod characterise captures/wall --certificate --about serial=1234 --out my_camera",
+    "tofpod characterise captures/near captures/far --certificate --about serial=7 --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

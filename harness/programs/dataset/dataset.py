@@ -33,7 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod, with random boards",
     )
-    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
+    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
     add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--boards",

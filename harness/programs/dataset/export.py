@@ -33,7 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="tum: one sequence; ros2 (sqlite3), mcap: one bag per view",
     )
     add("--out", required=True, type=Path, metavar="DIR", help="a new or empty folder")
-    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
+    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
     add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--views",

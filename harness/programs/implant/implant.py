@@ -166,7 +166,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "only the damage is "
     "simulated.",
     "tofpod implant captures/wall --camera azure_kinect_nfov --damage hole --diameters 2:10",
-    "tofpod implant captures/wall --camera kinect_v2 --damage dent --diameters 8:30 --depths 1:4",
+    "tofpod implant captures/wall --camera azure_kinect_nfov --damage dent --diameters 8:30 "
+    "--depths 1:4",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130

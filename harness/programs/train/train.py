@@ -147,14 +147,14 @@ def _trained(
 ) -> tuple[Network, list[list[float]]]:
     """Return the network, and the mean loss of each pass on the pictures trained on and on those
     held out."""
-    from harness.programs.train.gradients import Descent, gradient_of, loss_of, new_network
+    from harness.programs.train.gradients import AdamDescent, gradient_of, loss_of, new_network
     from harness.programs.train.pictures import example_of, prior_of
     from harness.vocabulary.seeds import random_stream
 
     shown = [picture for picture in pictures if picture.board % HELD_OUT != HELD_OUT - 1]
     held_out = [picture for picture in pictures if picture.board % HELD_OUT == HELD_OUT - 1]
     network = new_network(channels, prior_of(shown), random_stream(seed, "weights"))
-    descent = Descent(network, passes * len(shown))
+    descent = AdamDescent(network, passes * len(shown))
     losses = []
     for number in range(passes):
         stream = random_stream(seed, "pass", number)

@@ -8,6 +8,7 @@ import pytest
 
 from harness.experiment.load import load_experiment
 from harness.inspection.arguments import assign, crop_from_text
+from harness.programs.coverage.coverage import _pose
 from harness.vocabulary import lengths
 from harness.vocabulary.declaration.yaml_source import DeclarationError, parse_yaml
 from harness.vocabulary.errors import UserError
@@ -103,3 +104,10 @@ def test_lengths_of_an_inspection() -> None:
     assert crop_from_text("box:-20cm,200,-0.15m,150,400,900")["x_mm"] == [-200.0, 200.0]
     with pytest.raises(UserError, match="not all of its values are numbers"):
         crop_from_text("polygon:1mm,2,3,4,5,6")
+
+
+def test_the_distance_of_a_pose() -> None:
+    assert _pose("70cm,20,-10") == _pose("0.7,20,-10") == (0.7, 20.0, -10.0)
+    for text in ("70,0,0", "wide,0,0", "0.7,0", "0.7,a,b"):
+        with pytest.raises(argparse.ArgumentTypeError):
+            _pose(text)
