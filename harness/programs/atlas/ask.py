@@ -124,7 +124,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     warnings = _warnings(used.values())
     answer = _headline(kind, asked, rows, size_mm)
-    notes = [_basis(rows), *_assumed(kind, rows, used.values())]
+    notes = [*_next_best(rows, size_mm), _basis(rows), *_assumed(kind, rows, used.values())]
     if not options.camera:
         notes += _same(used.values())
     if options.damage.lower() == "scratch":
@@ -281,10 +281,9 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
         best = min(rows, key=order)
         if math.isnan(best.answer.a90_mm):
             return f"At {conditions.distance_m:g} m, no limit of {DAMAGE[kind]}s{deep} is known."
-        bound = f"{best.answer.low_mm:.2g} to {best.answer.high_mm:.2g} mm"
         return (
             f"At {conditions.distance_m:g} m, {best.surface.title} finds the smallest"
-            f" {DAMAGE[kind]}s{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound})"
+            f" {DAMAGE[kind]}s{deep} nine times out of ten: {_interval(best)}"
             f" with {many(best.conditions.frames, 'frame')} on albedo {best.conditions.albedo:g}."
         )
     verdicts = [row.verdict for row in rows]
@@ -296,6 +295,31 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
     what = f"{DAMAGE[kind].capitalize()}s of {size_mm:g} mm{deep} at {conditions.distance_m:g} m"
     count = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}{beside}"
     return f"{what} are found nine times out of ten in {count}."
+
+
+def _interval(row: Row) -> str:
+    """Return ``2.8 mm (2.3 to 3.6 mm)``."""
+    answer = row.answer
+    return f"{answer.a90_mm:.2g} mm ({answer.low_mm:.2g} to {answer.high_mm:.2g} mm)"
+
+
+def _next_best(rows: Sequence[Row], size_mm: float) -> list[str]:
+    """Say which other camera finds the next smallest damage, and whether the order is certain;
+    nothing if a size is asked for, or there is no other with a limit."""
+    from harness.programs.atlas.tables import order
+    from harness.vocabulary.text import many
+
+    best, *others = sorted(rows, key=order)
+    others = [row for row in others if row.surface.title != best.surface.title]
+    if not math.isnan(size_mm) or not others or math.isnan(others[0].answer.a90_mm):
+        return []
+    second = others[0]
+    order_is = "is certain" if second.answer.low_mm > best.answer.high_mm else "is not certain"
+    frames = many(second.conditions.frames, "frame")
+    return [
+        f"Next: {second.surface.title}, {_interval(second)} with {frames}; by their intervals, the"
+        f" order of the two {order_is}."
+    ]
 
 
 def _warnings(shards: Any) -> list[str]:

@@ -55,6 +55,7 @@ def test_without_a_size_the_smallest_found_is_the_answer(
     output = said("--damage dents --depth 1mm --distance 0.5m", atlas, capsys)
     assert output.startswith("At 0.5 m, Sharp One, short mode finds the smallest dents, 1 mm deep,")
     assert "with 50 frames" in output.splitlines()[0] and "found?" not in output
+    assert "Next: Dim 2, " in output and "order of the two is" in output
     assert "The same numbers: Twin Two as Sharp One, short mode." in output
 
 
