@@ -130,6 +130,11 @@ PROGRAMS = (
         "harness.programs.dataset.score",
         "states the detection limit of a method's anomaly maps",
     ),
+    ProgramEntry(
+        "start",
+        "harness.programs.start.start",
+        "asks for camera, part and damage, and writes an experiment and the commands to run",
+    ),
     ProgramEntry("sweep", "harness.sweep", "runs an experiment and writes its report"),
     ProgramEntry(
         "target",
@@ -153,6 +158,7 @@ PART_OF_SET_UP = ProgramEntry(
 """It runs as the others do and is not listed, because `make` calls it once."""
 MODULES = {listed.name: listed.module for listed in (*PROGRAMS, PART_OF_SET_UP)}
 TASKS = (
+    ("be asked, and get an experiment with the commands to run", "tofpod start"),
     ("run an experiment and read its report", "tofpod sweep averaging"),
     ("state the smallest hole that a camera finds", "tofpod sweep detection_limit"),
     ("find the damage in your own capture", "tofpod detect captures/board --out findings"),

@@ -36,6 +36,7 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     add("--target", type=whole_number(10**9), metavar="N", help=target)
     add(
         "--detector",
+        metavar="NAME",
         default=cli.DEFAULT_DETECTOR,
         help=(
             f"name of the detector; {cli.DEFAULT_DETECTOR} (default): of "
@@ -124,8 +125,8 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
     "deviates from it."
     " With --register, each PATH is one view of the same target, and all views are merged "
     "into one cloud.",
-    epilog="examples: tofpod detect recording.mkv --crop box:-200,200,-150,150,400,900 --out found/"
-    "; tofpod detect left.mcap right.mcap --register marks --merge fusion --out found/",
+    "tofpod detect captures/board --out findings",
+    "tofpod detect left right --register marks --marks coded --out findings",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -16,10 +16,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a YAML file, or the name of one that comes with tofpod, such as averaging",
     )
     help = (
-        "change a value of the file, such as repeats=5 or source.target.distance_m=0.9; may be "
+        "change a value of the file, such as repeats=5 or source.target.distance_m=90cm; may be "
         "repeated"
     )
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=help)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=help)
     help = (
         "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit "
         "is simulated"
@@ -47,6 +47,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "Run an experiment: render its targets, simulate the camera, detect and measure damage, "
         "and write a report."
     ),
+    "tofpod sweep averaging --quick",
+    "tofpod sweep detection_limit --set source.target.distance_m=90cm --jobs 8",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

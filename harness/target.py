@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
+from harness.vocabulary.words import nearest
 
 if TYPE_CHECKING:
     from scenes.target.custom import TargetConfig
@@ -39,7 +40,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 @program(
     _options,
     "Build a target with damage from its declaration, print its truth, and write its mesh.",
-    epilog="example: tofpod target thesis --out board.glb --truth truth.json",
+    "tofpod target thesis --out board.glb --truth truth.json",
+    "tofpod target thesis --hole-free --out board.ply",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake."""
@@ -79,8 +81,10 @@ def declared(what: str | Path | Mapping[str, Any], board: int) -> TargetConfig:
             )
         config = settings_of(TARGETS[what["name"]], what, "target")
     elif not Path(what).exists():
+        meant = nearest(what, NAMED_TARGETS)
         raise UserError(
-            f"{what}: there is no such file or named target",
+            f"{what}: there is no such file or named target"
+            + (f"; did you mean {meant!r}?" if meant else ""),
             legal=f"{', '.join(NAMED_TARGETS)} or a file",
         )
     else:

@@ -110,7 +110,7 @@ EXCEPTIONS = (
 
 
 @dataclass
-class Comparison:
+class FolderComparison:
     """The differences between two folders."""
 
     # lines that state the differences, by path
@@ -164,9 +164,9 @@ def compare_folders(
     new_folder: Path,
     parts: Sequence[str] = (),
     exceptions: Sequence[ExpectedDifference] = EXCEPTIONS,
-) -> Comparison:
+) -> FolderComparison:
     """Compare all files of two folders, or only those in folders named ``parts`` in both."""
-    comparison = Comparison()
+    comparison = FolderComparison()
     old_files = result_files(old_folder)
     new_files = result_files(new_folder)
     for path in sorted(old_files.keys() | new_files.keys()):
@@ -230,7 +230,7 @@ def _compare_file(
     old_file: Path,
     new_file: Path,
     expected: Expectations,
-    comparison: Comparison,
+    comparison: FolderComparison,
 ) -> None:
     comparison.compared += 1
     old_content = old_file.read_bytes()
@@ -455,7 +455,7 @@ COMPARED_BY_SUFFIX: dict[str, Compare] = {
 # ---- the program ---------------------------------------------------------------------------------
 
 
-def report_lines(comparison: Comparison, shown: int | None) -> Iterator[str]:
+def report_lines(comparison: FolderComparison, shown: int | None) -> Iterator[str]:
     """Yield the report; ``shown`` limits the differences of a file."""
     for path, differences in comparison.differences.items():
         yield path

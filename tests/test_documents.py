@@ -30,7 +30,7 @@ import tofpod
 from detectors import detector_type
 from detectors.methods.learned import SHIPPED
 from detectors.methods.network import read_network
-from harness.__main__ import MODULES, main
+from harness.__main__ import MODULES, PROGRAMS, main
 from harness.experiment.load import load_experiment
 from harness.vocabulary.geometry import MM, Cloud, Lens
 from tests.detectors.surfaces.test_reference import casting
@@ -399,6 +399,19 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+@pytest.fixture
+def home(inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: a copy of the inputs, which shares the results with all others."""
+    home = tmp_path / "home"
+    shutil.copytree(
+        inputs, home, symlinks=True, copy_function=os.link, ignore=lambda *_: ["results"]
+    )
+    (inputs / "results").mkdir(exist_ok=True)
+    (home / "results").symlink_to(inputs / "results")
+    monkeypatch.chdir(home)
+    return home
+
+
 @pytest.fixture(scope="module")
 def already_run() -> set[str]:
     """Commands that write into the results that all documents share: the next document need not
@@ -456,19 +469,15 @@ def prepare(command: str, home: Path) -> None:
 @pytest.mark.parametrize(
     "path", [path for path in TEXTS if any(commands_in(path))], ids=lambda path: path.name
 )
-def test_every_command_runs(
-    path: Path, inputs: Path, already_run: set[str], tmp_path: Path, monkeypatch, capfd
-):
-    home = tmp_path / "home"
-    shutil.copytree(
-        inputs, home, symlinks=True, copy_function=os.link, ignore=lambda *_: ["results"]
-    )
-    (inputs / "results").mkdir(exist_ok=True)
-    (home / "results").symlink_to(inputs / "results")
+def test_every_command_runs(path: Path, home: Path, already_run: set[str], capfd):
     for name, text in re.findall(r"\n    # (\w+\.yaml)\n((?:    .*\n)+)", path.read_text()):
         (home / name).write_text(textwrap.dedent(text))
-    monkeypatch.chdir(home)
-    for name, *arguments in commands_in(path):
+    run_all(commands_in(path), home, already_run, capfd)
+
+
+def run_all(commands, home: Path, already_run: set[str], capfd) -> None:
+    """Run commands on small inputs, but those of `ONLY_PARSED`."""
+    for name, *arguments in commands:
         command = shlex.join([name, *arguments])
         reference = re.sub(r"experiments/(\w+)\.yaml", r"\1", command)
         if reference not in already_run and not any(part in command for part in ONLY_PARSED):
@@ -476,6 +485,18 @@ def test_every_command_runs(
             prepare(command, home)
             code = main([name, *shrunk(name, filled(arguments, home))])
             assert code == 0, f"{command}\n{''.join(capfd.readouterr())}"
+
+
+@pytest.mark.slow
+def test_every_example_of_a_help_runs(home: Path, already_run: set[str], capfd):
+    documented = [words for path in TEXTS for words in commands_in(path)]
+    examples = []
+    for entry in PROGRAMS:
+        for example in importlib.import_module(entry.module).main.examples:
+            words = shlex.split(example)[1:]
+            if words not in documented and "DIGEST" not in example:
+                examples.append(words)
+    run_all(examples, home, already_run, capfd)
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from harness.vocabulary import files
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RAISE, refuse_bytes, refuse_pixels
 from harness.vocabulary.geometry import Frame, Lens, Reason
+from harness.vocabulary.program import length_m
 
 LEGAL_ARRAYS = "numeric arrays as written by numpy.save or numpy.savez, without objects"
 LEGAL_MAT = (
@@ -559,11 +560,9 @@ def _open_height_map(path: Path, load: ArraysLoader, options: CaptureOptions) ->
 
 def _pitch_m(text: str) -> float:
     """Parse the distance between a map's pixels, metres. Raises UserError for anything else."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e-?\d+)?)\s*(um|mm|cm|m)", text.strip())
-    pitch_m = float(match.group(1)) * UNITS_M[match.group(2)] if match else math.nan
+    pitch_m = length_m("--pitch", text)
     if not 1e-7 <= pitch_m <= 1:
-        legal = "the distance between pixels with its unit, for instance 0.5mm, 200um or 0.001m"
-        raise UserError(f"--pitch {text}: is not a length", legal=legal)
+        raise UserError(f"--pitch {text}: is no distance between pixels", legal="0.1um to 1m")
     return pitch_m
 
 

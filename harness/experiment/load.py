@@ -30,6 +30,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.path_names import UNKNOWNS
 from harness.vocabulary.provenance import check_version, stamp_of, stamped
+from harness.vocabulary.words import nearest
 from scenes.sensor.camera import camera_names, is_camera_path, load_camera, numbers_of_lens
 from scenes.sensor.common.config import CameraConfig
 
@@ -118,9 +119,12 @@ def _experiment_file(path: Path) -> Path:
         return path
     shipped_file = shipped("experiments") / f"{path.name.removesuffix('.yaml')}.yaml"
     if not (shipped_file.is_file() or path.suffix or path.exists()):
-        names = ", ".join(sorted(file.stem for file in shipped_file.parent.glob("*.yaml")))
+        names = sorted(file.stem for file in shipped_file.parent.glob("*.yaml"))
+        meant = nearest(path.name, names)
         raise UserError(
-            f"{path}: there is no such file or experiment", legal=f"a YAML file, or one of {names}"
+            f"{path}: there is no such file or experiment"
+            + (f"; did you mean {meant!r}?" if meant else ""),
+            legal=f"a YAML file, or one of {', '.join(names)}",
         )
     return shipped_file if shipped_file.is_file() else path
 

@@ -154,7 +154,9 @@ def overridden(
         path = key_path(name.strip())
         declared = declared_of(source.data)
         try:
-            value = parse_yaml(text, OPTION, start=len(name) + 1, is_argument=True)
+            value = parse_yaml(
+                text, OPTION, start=len(name) + 1, is_argument=True, key=name.strip()
+            )
             problem = path_problem(path, declared, position)
             if problem is None:
                 source = source.with_value(

@@ -4,7 +4,6 @@ stated poses."""
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json
+from harness.vocabulary.lengths import in_unit, states_unit
 from harness.vocabulary.program import length_m
 from harness.vocabulary.provenance import RESULTS_VERSION, check_version
 
@@ -41,7 +41,10 @@ CANDIDATES = ("matched", "local", "thesis")
 PREFIX = "mapping."
 STATED_SURFACE = ("surface=", "surface.degree", "surface.method", "surface.drop")
 """Settings that state a polynomial: without them, the surface's shape is chosen by evidence."""
-LEGAL_CROP = "auto, none, box:x0,x1,y0,y1,z0,z1 (mm, camera frame), polygon:u,v,u,v,u,v.. (pixels)"
+LEGAL_CROP = (
+    "auto, none, box:x0,x1,y0,y1,z0,z1 (mm or with units, camera frame), "
+    "polygon:u,v,u,v,u,v.. (pixels)"
+)
 
 
 READING = (
@@ -292,12 +295,13 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
             "is another crop"
         )
         raise UserError(message, fix="leave out one of the two")
-    try:
-        numbers = [float(value) for value in values.split(",")] if values else []
-    except ValueError as error:
-        raise UserError(
-            f"--crop {text}: not all of its values are numbers", legal=LEGAL_CROP
-        ) from error
+    numbers = []
+    for value in values.split(",") if values else ():
+        number = in_unit(value, "mm") if kind == "box" or not states_unit(value) else None
+        if number is None:
+            problem = f"--crop {text}: not all of its values are numbers"
+            raise UserError(problem, legal=LEGAL_CROP)
+        numbers.append(number)
     pairs = [numbers[i : i + 2] for i in range(0, len(numbers), 2)]
     if kind in ("auto", "none") and not numbers:
         return {"kind": kind} if target is None else {"kind": kind, "target": target}
@@ -320,17 +324,16 @@ def crop_from_text(text: str, target: int | None = None) -> dict[str, Any]:
 
 
 def assign(settings: dict[str, Any], assignment: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is JSON if possible, else text. UserError
+    """Put one KEY=VALUE into nested settings; the value is YAML, as in an experiment. UserError
     without one."""
-    path, equals, text = assignment.partition("=")
-    if not (path and equals):
+    from harness.vocabulary.declaration.yaml_source import parse_yaml
+
+    path, _, text = assignment.partition("=")
+    if not (path.strip() and text.strip()):
         raise UserError(
             f"--set {assignment}: has no value", legal="KEY=VALUE, for instance surface.degree=5"
         )
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = text
+    value = parse_yaml(assignment, "--set", start=len(path) + 1, is_argument=True, key=path).data
     *folders, leaf = path.split(".")
     for folder in folders:
         settings = settings.setdefault(folder, {})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from harness.runs.jobs import Limits
 from harness.runs.shards import WHOLE, Shard
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.program import whole_number
+from harness.vocabulary.program import BYTES, bytes_of, whole_number
 
 DEFAULT_LIMITS = Limits(
     seconds=900.0, memory_mb=4000
@@ -58,23 +58,17 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="run again the trials that failed, crashed or timed out before",
     )
-    for name, unit, default, meaning in (
-        ("--time-limit", "SECONDS", 900.0, "time that one trial or render may take"),
-        ("--memory-limit", "GB", 4.0, "memory that a trial's process may use, also on a cluster"),
-        (
-            "--cache-limit",
-            "GB",
-            20.0,
-            "size of all stored renders; the least recently used are removed first",
-        ),
-    ):
-        add(
-            name,
-            type=_positive,
-            default=default,
-            metavar=unit,
-            help=f"{meaning} (default: {default:g})",
-        )
+    add(
+        "--time-limit",
+        type=_positive,
+        default=900.0,
+        metavar="SECONDS",
+        help="time that one trial or render may take (default: 900)",
+    )
+    memory = "memory that a trial's process may use, also on a cluster (default: 4GB)"
+    add("--memory-limit", type=_gigabytes, default=4.0, metavar="SIZE", help=memory)
+    cache = "size of all stored renders; the least recently used are removed first (default: 20GB)"
+    add("--cache-limit", type=_gigabytes, default=20.0, metavar="SIZE", help=cache)
 
 
 def engine_options(options: argparse.Namespace) -> EngineOptions:
@@ -100,6 +94,13 @@ def engine_options(options: argparse.Namespace) -> EngineOptions:
         retry_failed=options.retry_failed,
         cache_limit_gb=options.cache_limit,
     )
+
+
+def _gigabytes(text: str) -> float:
+    size_gb = bytes_of(text) / BYTES["GB"]
+    if size_gb == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
+    return size_gb
 
 
 def _positive(text: str) -> float:

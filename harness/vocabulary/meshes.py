@@ -4,11 +4,12 @@ camera."""
 import io
 import logging
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
 
+from harness.vocabulary import lengths
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import bounded_bytes, limited_memory
 
@@ -21,7 +22,7 @@ FrontAxis = Annotated[
     Field(description="the file's axis that points at the camera"),
 ]
 FileUnit = Literal["mm", "cm", "m", "in"]
-UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+UNITS_M = {unit: lengths.UNITS_M[unit] for unit in get_args(FileUnit)}
 FRONTS = {
     "+x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),

@@ -194,7 +194,7 @@ OTHERS = (
          weight=8),
     Case("design", "--study tables/a --studies 20 --targets 30", ["tables"],
          ["tables/a/study.json"], weight=4),
-    Case("design", "--a50 4 --a90 6 --sizes 1 12 --studies 20 --targets 30", []),
+    Case("design", "--a50 4 --a90 6 --sizes 1:12 --studies 20 --targets 30", []),
     Case("gauge", "--diameters 2:12 --study tables/a --out made", ["tables"],
          ["tables/a/study.json"], weight=3),
     Case("gauge", "read pngs --gauge made/gauge/gauge.json", ["pngs", "made"],
@@ -219,12 +219,12 @@ OTHERS = (
           "runs/out/.cache/renders/*.npz"], weight=3),
     Case("merge", "runs/out/tiny/latest --into merged", ["runs"],
          ["runs/out/tiny/[0-9a-f]*/*", "runs/out/tiny/[0-9a-f]*/journal/*"], weight=5),
-    Case("ls", "results --out runs/out", ["runs"], ["runs/out/tiny/[0-9a-f]*/*"], weight=4),
-    Case("ls", "cache --out runs/out", ["runs"], ["runs/out/.cache/renders/*.npz"]),
+    Case("ls", "results --results runs/out", ["runs"], ["runs/out/tiny/[0-9a-f]*/*"], weight=4),
+    Case("ls", "cache --results runs/out", ["runs"], ["runs/out/.cache/renders/*.npz"]),
     Case("ls", "parts/kinect_v2.yaml", ["parts"], ["parts/kinect_v2.yaml"]),
-    Case("clean", "results tiny --out runs/out --dry-run", ["runs"],
+    Case("clean", "results tiny --results runs/out --dry-run", ["runs"],
          ["runs/out/tiny/[0-9a-f]*/*"], weight=2),
-    Case("clean", "cache --all --out runs/out --dry-run", ["runs"], ["runs/out/.cache/renders/*"]),
+    Case("clean", "cache --all --results runs/out --dry-run", ["runs"], ["runs/out/.cache/renders/*"]),
 )  # fmt: skip
 CASES = (*CAPTURES, *REFERENCES, *EARLIER, *LENSES, *VIEWS, *CAMERAS, *EXPERIMENTS, *OTHERS)
 ODD_ARGUMENT = 0.08

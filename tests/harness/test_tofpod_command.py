@@ -33,7 +33,7 @@ def test_a_program_runs_with_its_own_arguments_and_exit_code(tmp_path, capsys):
     assert main(["sweep", "smoke", "--dry-run", "--out", str(tmp_path)]) == 0
     assert "smoke: valid" in capsys.readouterr().out
     assert main(["sweep", "smok", "--out", str(tmp_path)]) == 2
-    assert "there is no such file" in capsys.readouterr().err
+    assert "there is no such file or experiment; did you mean 'smoke'?" in capsys.readouterr().err
     assert main(["swep"]) == 2
     assert "did you mean sweep?" in capsys.readouterr().err
     assert main(["completion", "fish"]) == 2

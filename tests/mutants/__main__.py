@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.mutants.draw import Equivalents, all_mutants, drawn, named
 from tests.mutants.kinds import Mutant
-from tests.mutants.page import Trial, page
+from tests.mutants.page import MutantTrial, page
 from tests.mutants.rooms import room_tests
 from tests.mutants.trying import BrokenTests, Tree, tried
 
@@ -96,11 +96,11 @@ def main() -> int:
     ready = [mutant for mutant in missing if mutant.file not in broken]
     records.update(try_all(ready, tree, results, arguments.jobs))
     equivalents = Equivalents(HERE / "equivalent.yaml")
-    trials: list[Trial] = []
+    trials: list[MutantTrial] = []
     for mutant in mutants:
         if mutant.key in records:
             state, test = records[mutant.key]
-            trials.append(Trial(mutant, state, test, equivalents.reason(mutant)))
+            trials.append(MutantTrial(mutant, state, test, equivalents.reason(mutant)))
     if arguments.named:
         return max(_report_named(trials, lost), int(bool(broken)))
     text = page(trials, arguments.seed)
@@ -141,7 +141,7 @@ def _print_list(mutants: Sequence[Mutant]) -> None:
         print(f"    {names}; then {len(indirect)} files of the room")
 
 
-def _report_named(trials: Sequence[Trial], lost: Sequence[str]) -> int:
+def _report_named(trials: Sequence[MutantTrial], lost: Sequence[str]) -> int:
     living = [trial for trial in trials if trial.lives]
     print(f"{len(trials) - len(living)} of {len(trials)} named faults are killed")
     for trial in living:

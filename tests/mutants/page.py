@@ -24,7 +24,7 @@ ones. A fault is killed if a test fails or takes much too long. Rooms in which f
 
 
 @dataclass(frozen=True)
-class Trial:
+class MutantTrial:
     """A mutant with its outcome."""
 
     mutant: Mutant
@@ -49,7 +49,7 @@ class Trial:
         return not self.is_killed and self.reason is None
 
 
-def share_text(trials: Sequence[Trial]) -> str:
+def share_text(trials: Sequence[MutantTrial]) -> str:
     """Return the killed share of the faults with Wilson's 95 % interval."""
     faults = [trial for trial in trials if not trial.is_equivalent]
     if not faults:
@@ -60,14 +60,14 @@ def share_text(trials: Sequence[Trial]) -> str:
     return f"{100 * share:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
 
 
-def _row(name: str, trials: Sequence[Trial]) -> str:
+def _row(name: str, trials: Sequence[MutantTrial]) -> str:
     killed = sum(trial.is_killed for trial in trials)
     equivalent = sum(trial.is_equivalent for trial in trials)
     lives = sum(trial.lives for trial in trials)
     return f"| {name} | {len(trials)} | {killed} | {equivalent} | {lives} | {share_text(trials)} |"
 
 
-def _table(rooms: dict[str, list[Trial]], trials: Sequence[Trial]) -> list[str]:
+def _table(rooms: dict[str, list[MutantTrial]], trials: Sequence[MutantTrial]) -> list[str]:
     """Return the rows of rooms in which faults live, and of all rooms together."""
     lines = [
         "| room | mutants | killed | equivalent | living | killed of the faults |",
@@ -79,7 +79,7 @@ def _table(rooms: dict[str, list[Trial]], trials: Sequence[Trial]) -> list[str]:
     return [*lines, _row("all", trials), ""]
 
 
-def _listed(trials: Sequence[Trial]) -> list[str]:
+def _listed(trials: Sequence[MutantTrial]) -> list[str]:
     lines: list[str] = []
     file = ""
     for trial in trials:
@@ -94,9 +94,9 @@ def _listed(trials: Sequence[Trial]) -> list[str]:
     return lines or ["None.", ""]
 
 
-def page(trials: Sequence[Trial], seed: int) -> str:
+def page(trials: Sequence[MutantTrial], seed: int) -> str:
     """Return the page in Markdown. ``trials``: in the order of their files."""
-    rooms: dict[str, list[Trial]] = {}
+    rooms: dict[str, list[MutantTrial]] = {}
     for trial in trials:
         room = Path(trial.mutant.file).parent.as_posix()
         rooms.setdefault(room, []).append(trial)

@@ -15,7 +15,7 @@ from tests.mutants.draw import (
     numeric_modules,
 )
 from tests.mutants.kinds import RULES, mutants_of, named_mutant
-from tests.mutants.page import Trial, page
+from tests.mutants.page import MutantTrial, page
 from tests.mutants.rooms import room_tests
 from tests.mutants.trying import BrokenTests, Tree, run_tests, users_of_kernels
 
@@ -315,7 +315,7 @@ def test_the_page_counts_equivalent_mutants_apart():
         ("survived", "No fault."),
     ]
     trials = [
-        Trial(mutant, state, "", reason)
+        MutantTrial(mutant, state, "", reason)
         for mutant, (state, reason) in zip(mutants, outcomes, strict=False)
     ]
     text = page(trials, seed=1)

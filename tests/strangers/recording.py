@@ -16,7 +16,7 @@ import numpy as np
 import scipy.io
 
 from harness.programs.camera import flatfield
-from tests.strangers.world import Camera, Damage, Surface, View, cast
+from tests.strangers.world import Camera, CastView, Damage, Surface, cast
 
 CLEAR_D = 3 * 5.5
 """A damage is clearly visible from three times the d' that an ideal observer needs (90 % found at
@@ -102,7 +102,7 @@ class Stranger:
 
 def recorded(
     stranger: Stranger, rng: np.random.Generator
-) -> tuple[np.ndarray, View, tuple[Truth, ...]]:
+) -> tuple[np.ndarray, CastView, tuple[Truth, ...]]:
     """(frames (n, h, w) in metres with NaN for no return, the noise-free view, the truth)."""
     view = cast(stranger.surfaces, stranger.camera)
     if stranger.model:
@@ -215,7 +215,7 @@ def _clusters(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> n
     return (seeds > 0) & (rng.random(shape) < 0.6)
 
 
-def _truths(stranger: Stranger, view: View) -> tuple[Truth, ...]:
+def _truths(stranger: Stranger, view: CastView) -> tuple[Truth, ...]:
     """Every damage, and whether it is clearly visible in this recording."""
     noise = stranger.noise
     n = stranger.frames

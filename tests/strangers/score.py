@@ -14,7 +14,7 @@ import numpy as np
 
 from harness import detect
 from tests.strangers.recording import Stranger, Truth
-from tests.strangers.world import View
+from tests.strangers.world import CastView
 
 NEAR_MM = 12.0
 FALSE_CALLS = 1
@@ -71,7 +71,7 @@ def answered(
 
 def scored(
     stranger: Stranger,
-    view: View,
+    view: CastView,
     truths: tuple[Truth, ...],
     code: int,
     said: str,
@@ -161,7 +161,7 @@ def _match(row: dict[str, str], truths: tuple[Truth, ...]) -> Truth | None:
     return best
 
 
-def _unmatched(stranger: Stranger, view: View, rows: list[dict[str, str]]) -> tuple[int, int]:
+def _unmatched(stranger: Stranger, view: CastView, rows: list[dict[str, str]]) -> tuple[int, int]:
     """(findings on another surface than the target, false findings on the target)."""
     cam, (h, w) = stranger.camera, view.on_target.shape
     elsewhere = false = 0

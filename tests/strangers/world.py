@@ -272,7 +272,7 @@ def _round(surface: Surface, start: np.ndarray, ray: tuple[np.ndarray, ...]) -> 
 
 
 @dataclass(frozen=True)
-class View:
+class CastView:
     """One noise-free view. ``depth_m`` (h, w), NaN where nothing returns; ``on_target`` where the
     target is seen; ``footprints``: of each damage its pixels (flat indices) and its signal there
     (metres along z; NaN: no return)."""
@@ -284,7 +284,7 @@ class View:
     hidden: tuple[float, ...]
 
 
-def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
+def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> CastView:
     """Cast ``finer`` x ``finer`` rays a pixel; the nearest surface wins, and its damage is cut
     where it is seen."""
     slopes = camera.slopes(finer)
@@ -310,7 +310,7 @@ def cast(surfaces: list[Surface], camera: Camera, finer: int = 1) -> View:
     target = observed & np.array([s.is_target for s in surfaces])[nearest]
     objects = observed & np.array([s.is_object for s in surfaces])[nearest]
     depth = np.where(np.isfinite(depth), depth, np.nan)
-    return View(depth, target, objects, tuple(feet), tuple(hidden))
+    return CastView(depth, target, objects, tuple(feet), tuple(hidden))
 
 
 def _signal(

@@ -27,6 +27,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Make the stored answers again that are older than the code: the atlas, the baseline of the "
     "gate, and tables and pictures of the documents, the most valuable first. An artefact of "
     "today's code is left as it is. It needs a checkout.",
+    "tofpod artefacts --only today --quick",
+    "tofpod artefacts --ages",
     epilog="The same command goes on after Ctrl-C. `tofpod ls artefacts` lists all with their age.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

@@ -41,7 +41,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Compute limits of damage for each camera, at three distances of its range, and write the"
     f" atlas from which tofpod ask answers ({MADE} in the folder of results). A shard of"
     " today's code is kept, also one that comes with tofpod.",
-    epilog="example: tofpod atlas my_camera.yaml, then tofpod ask --atlas results/atlas/atlas.json",
+    "tofpod atlas kinect_v2 --dry-run",
+    "tofpod atlas pmd_flexx2 realsense_l515",
+    epilog="Then ask: tofpod ask --distance 1m --atlas results/atlas/atlas.json",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

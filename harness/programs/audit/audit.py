@@ -46,6 +46,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "stated for simulated studies of steep and flat curves, few and many targets, and boards that "
     "differ; diameters, depths and false calls for boards that are rendered and recorded by one "
     "simulated camera. Write audit.html, audit.csv and audit.parquet.",
+    "tofpod audit --quick",
+    "tofpod audit --quick --no-boards --out audit",
     epilog="The whole takes some 15 minutes on two cores, --quick a few.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

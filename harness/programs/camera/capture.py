@@ -31,7 +31,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
         )
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}", legal="a number above 0, up to 1")
-    first = slice(options.frames) if options.frames else None
+    first = slice(options.max_frames) if options.max_frames else None
     camera_name = options.camera[0] if options.camera else None
     recording = opened_as(
         camera_name, options.capture, options.intrinsics, frames=first, **reading_of(options)

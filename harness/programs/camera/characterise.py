@@ -74,7 +74,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "experiments (source.camera.name: ./my_camera.yaml). Each PATH is a capture of 50 frames or "
     "more, in any format that tofpod detect reads, in order of time. Captures at several "
     "distances, with the camera moved sideways by 30 mm or more, show the most.",
-    epilog="example: tofpod characterise near far --like azure_kinect_nfov --out my_camera",
+    "tofpod characterise captures/near captures/far --like azure_kinect_nfov --out my_camera",
+    "tofpod characterise captures/wall --certificate --about serial=1234 --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

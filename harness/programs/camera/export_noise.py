@@ -43,7 +43,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Write a simulated camera's depth noise as a small table (NAME.npz) and as code for NumPy and "
     "torch that turns ideal depth and intensity into noisy depth, for use in other simulators.",
-    epilog="example: tofpod export_noise azure_kinect_nfov --out noise",
+    "tofpod export_noise azure_kinect_nfov --out noise",
+    "tofpod export_noise kinect_v2 --out noise",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -59,8 +59,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "the same in every frame. Each PATH is a capture of 50 frames or more of a matte wall that "
     "fills the view. Record with a warm camera, several times at each of two distances, and move "
     "it by 30 mm or more between captures. Name the captures in the order of recording.",
-    epilog="example: tofpod flatfield near1 near2 far1 far2 --out unit.npz, then "
-    "tofpod detect captures/board --flat-field unit.npz",
+    "tofpod flatfield near1 near2 far1 far2 --out unit.npz",
+    "tofpod flatfield near1 near2 far1 far2 --unit mm --crop none --out unit.npz",
+    epilog="Then: tofpod detect captures/board --flat-field unit.npz.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if the pattern is not stable), 2 for a user's mistake, 130

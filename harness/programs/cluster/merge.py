@@ -28,10 +28,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Copy the trials of results folders (such as those of `tofpod sweep --shard`) to "
     "another folder. "
     "Nothing is run; if several folders hold a trial, a finished record is used.",
-    epilog="example: tofpod merge shard1/averaging/0123456789abcdef "
-    "shard2/averaging/0123456789abcdef "
-    "--into results/averaging/0123456789abcdef; then the sweep's own command, without "
-    "--shard, writes the report",
+    "tofpod merge shard1/averaging/DIGEST shard2/averaging/DIGEST --into results/averaging/DIGEST",
+    "tofpod merge laptop/cameras/DIGEST server/cameras/DIGEST --into results/cameras/DIGEST",
+    epilog="Afterwards the sweep's own command, without --shard, writes the report.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if two journals give different results for a trial, 2 for a

@@ -13,6 +13,7 @@ import numpy as np
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
+from harness.vocabulary.lengths import in_unit
 from harness.vocabulary.path_names import camera_title, in_words
 from harness.vocabulary.program import program, whole_number
 
@@ -38,18 +39,18 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod: a study of drawn damage",
     )
-    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add("--detector", metavar="NAME", help="the only detector, of an experiment that compares some")
     pose = (
-        "distance in metres and tilts of the part about x and y in degrees, such as 0.7,20,-10; "
+        "distance (bare: m) and tilts of the part about x and y in degrees, such as 0.7,20,-10; "
         "may be repeated"
     )
     add(
         "--pose",
         action="append",
         type=_pose,
-        metavar="M,DEG,DEG",
+        metavar="LENGTH,DEG,DEG",
         help=f"{pose} (default: the experiment's, frontal)",
     )
     add(
@@ -81,8 +82,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 
 def _pose(text: str) -> Pose:
+    distance_text, *tilts = text.split(",")
+    distance_m = in_unit(distance_text, "m") or 0.0
     try:
-        distance_m, tilt_x, tilt_y = map(float, text.split(","))
+        tilt_x, tilt_y = map(float, tilts)
     except ValueError as error:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not DISTANCE,TILT,TILT, such as 0.7,20,0"
@@ -101,7 +104,8 @@ def _pose(text: str) -> Pose:
     "distance and missing returns there, and the share of the part on which a wanted size "
     "is found. Write tables and a "
     "page on which the part can be turned.",
-    epilog="example: tofpod coverage pipe --goal 3mm --share 0.9",
+    "tofpod coverage pipe --size 3mm --suggest 2",
+    "tofpod coverage pipe --goal 3mm --share 0.9",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Return 0 (even if a goal is not reached), 2 after a user's mistake, 130 after Ctrl-C."""

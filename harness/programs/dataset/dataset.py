@@ -33,8 +33,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod, with random boards",
     )
-    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--boards",
         type=int,
@@ -68,6 +68,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     _options,
     "Write a data set of simulated boards with organised clouds, depth, intensity, validity, "
     "masks and truth: as NPZ and PNG, in the layout of MVTec 3D-AD, and as COCO masks.",
+    "tofpod dataset detection_limit --boards 500 --out boards",
+    "tofpod dataset panel --boards 100 --set source.target.distance_m=0.9 --out panels",
     epilog="Finished boards are kept: the same command resumes after Ctrl-C or a fault. "
     "tofpod score states the detection limit of any anomaly maps on it.",
 )

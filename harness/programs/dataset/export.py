@@ -25,7 +25,7 @@ REPEAT = 0
 
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("experiment", type=Path, metavar="EXPERIMENT.yaml", help="an experiment's file or name")
+    add("experiment", type=Path, help="an experiment's file or name")
     add(
         "--format",
         required=True,
@@ -33,8 +33,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="tum: one sequence; ros2 (sqlite3), mcap: one bag per view",
     )
     add("--out", required=True, type=Path, metavar="DIR", help="a new or empty folder")
-    change = "change a value of the file, such as source.target.distance_m=0.9; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--views",
         type=whole_number(10_000),
@@ -56,8 +56,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Render and simulate the views of an experiment, and write them with their true poses and "
     "damages as a TUM RGB-D sequence, or as a ROS 2 bag per view with PointCloud2, CameraInfo and "
     "tf_static.",
-    epilog="example: tofpod export experiments/perspectives.yaml --format mcap --views 3 "
-    "--out bags/",
+    "tofpod export perspectives --format mcap --views 3 --out bags",
+    "tofpod export perspectives --format tum --frames 10 --hole-free --out sequence",
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -49,7 +49,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a folder that tofpod dataset wrote",
     )
     rate = "wanted false calls per square metre, which sets the threshold (default: the data set's)"
-    add("--false-calls", type=float, metavar="RATE", help=rate)
+    add("--false-calls-per-m2", type=float, metavar="RATE", help=rate)
     add(
         "--name",
         default="maps",
@@ -70,8 +70,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "with AU-PRO and AUROC. PREDICTIONS holds a map for each board of validation and test: "
     "<category>/<split>/<label>/<number>.npy or .tiff, with the size of the pictures, higher for "
     "likely damage.",
-    epilog="example: tofpod score maps --dataset boards --out scores; tofpod compare compares "
-    "two such folders of results.",
+    "tofpod score maps --dataset boards --out scores",
+    "tofpod score maps --dataset boards --name ours --out scores",
+    epilog="tofpod compare compares two such folders of results.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake."""
@@ -88,9 +89,15 @@ def main(options: argparse.Namespace, command: str) -> int:
             f"{options.dataset}: is not finished",
             fix="run the command that wrote it again; it continues",
         )
-    rate = index["false_calls_per_m2"] if options.false_calls is None else options.false_calls
+    rate = (
+        index["false_calls_per_m2"]
+        if options.false_calls_per_m2 is None
+        else options.false_calls_per_m2
+    )
     if not 0 < rate <= 1e6:
-        raise UserError(f"--false-calls {rate:g}", legal="above 0, up to 1e6 per square metre")
+        raise UserError(
+            f"--false-calls-per-m2 {rate:g}", legal="above 0, up to 1e6 per square metre"
+        )
     maps = _found(options.predictions, options.dataset, index["samples"])
     judged = [_judged(category, maps, options, index, rate) for category in index["categories"]]
     limits = [limit for limit, _ in judged]

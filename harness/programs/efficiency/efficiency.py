@@ -27,6 +27,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "at the study's rate of false calls, and every detector's efficiency. Write "
     f"{EFFICIENCY_PAGE.name} and tables to "
     "the study's folder.",
+    "tofpod efficiency results/detection_limit/latest",
+    "tofpod efficiency results/frames/latest --jobs 8",
     epilog=(
         "The program takes some seconds per damaged board. Views without a stored render are "
         "rendered again."

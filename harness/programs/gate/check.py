@@ -46,7 +46,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     change = (
         "change a value of the file, such as seed=7 for another draw of the noise; may be repeated"
     )
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add(
         "--baseline",
         type=Path,
@@ -71,6 +71,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "limit or the rate of false calls has grown by more than 10 % and a paired test shows "
     "that this is not by "
     "chance, if a set-up no longer has a limit, or if more trials fail.",
+    "tofpod check experiments/regression.yaml",
+    "tofpod check experiments/regression.yaml --update",
     epilog="Finished trials are kept: the same command resumes after Ctrl-C or a fault.",
 )
 def main(options: argparse.Namespace, command: str) -> int:

@@ -43,6 +43,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "hits and false calls with tests, and a mark for each set-up: + worse, - better, ~ not "
     "significant, ! newly "
     "failing, x not comparable.",
+    "tofpod compare A B",
+    "tofpod compare A B --alpha 0.01 --out compared",
     epilog="Set-ups are paired by name and frames; if each study has a single set-up, the two are "
     "paired. Tests are "
     "paired if both studies have the same boards. tofpod check fails if a detection limit grew.",

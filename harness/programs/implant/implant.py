@@ -14,7 +14,9 @@ import numpy as np
 from harness.inspection import arguments as cli
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
-from harness.vocabulary.program import program, span
+from harness.vocabulary.lengths import LEGAL, in_unit
+from harness.vocabulary.program import length, program, span
+from harness.vocabulary.words import damage_kind
 
 if TYPE_CHECKING:
     from detectors.interface import Detector
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 DAMAGES = ("through", "blind", "dent", "pressed_dent", "pressed_bump", "protrusion", "slot")
 # Most damages of a placement
 MOST_AT_ONCE = 8
+# Least room between damages
+ROOM_MM = 10.0
 # Largest share of the scan within half of --apart from a placement's damages
 FILLED = 0.25
 COMPARED = (
@@ -55,35 +59,36 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "--damage",
         required=True,
-        choices=DAMAGES,
-        help="kind of damage, as on the drawn boards of an experiment",
+        metavar="KIND",
+        help=f"hole, {', '.join(DAMAGES)}",
     )
     add(
         "--diameters",
         required=True,
-        type=span,
+        type=span("mm"),
         metavar="FROM:TO",
-        help="diameters, mm; for slots their widths",
+        help="diameters (bare numbers: mm); for slots their widths",
     )
     add(
         "--depths",
-        type=span,
+        type=span("mm"),
         metavar="FROM:TO",
-        help="depths, mm (for bumps and protrusions, heights)",
+        help="depths (bare: mm); of bumps and protrusions the heights",
     )
-    add("--lengths", type=span, metavar="FROM:TO", help="lengths of slots, mm")
+    add("--lengths", type=span("mm"), metavar="FROM:TO", help="lengths of slots (bare: mm)")
     add(
         "--thickness",
-        type=float,
+        type=length("mm"),
         default=12.7,
-        metavar="MM",
-        help="thickness of the part (default: 12.7)",
+        metavar="LENGTH",
+        help="thickness of the part (bare: mm; default: 12.7)",
     )
-    behind = "distance to the surface behind a through-hole, mm, or none (default: 20)"
-    add("--backing", default="20", metavar="MM|none", help=behind)
+    behind = "distance to the surface behind a through-hole (bare: mm), or none (default: 20)"
+    add("--backing", default="20", metavar="LENGTH|none", help=behind)
     add(
         "--albedo",
         type=float,
+        metavar="A",
         default=0.6,
         help="albedo of part and backing at this wavelength (default: 0.6)",
     )
@@ -103,16 +108,17 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--hit-radius",
-        type=float,
+        type=length("mm"),
         default=15.0,
-        metavar="MM",
-        help="largest distance of a hit (default: 15)",
+        metavar="LENGTH",
+        help="largest distance of a hit (bare: mm; default: 15)",
     )
     add(
         "--apart",
-        type=float,
-        metavar="MM",
-        help="least distance of damages (default: 2 hit radii plus 10)",
+        type=length("mm"),
+        metavar="LENGTH",
+        help="least distance of damages (bare: mm; default: 10 more than 2 hit radii and than the "
+        "largest damage)",
     )
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
     calls = (
@@ -128,6 +134,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--detector",
+        metavar="NAME",
         default=cli.CANDIDATES[0],
         help=f"detector's name (default: {cli.CANDIDATES[0]})",
     )
@@ -158,8 +165,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "is one static capture. The frames keep their own noise, fixed pattern and surface; "
     "only the damage is "
     "simulated.",
-    epilog="example: tofpod implant captures/wall --camera azure_kinect_nfov --damage through "
-    "--diameters 2:10 --out implanted",
+    "tofpod implant captures/wall --camera azure_kinect_nfov --damage hole --diameters 2:10",
+    "tofpod implant captures/wall --camera kinect_v2 --damage dent --diameters 8:30 --depths 1:4",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130
@@ -173,6 +180,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     # options of tofpod detect that this program lacks
     options.quiet_capture = None
     options.target = None
+    options.damage = damage_kind("--damage", options.damage, DAMAGES)
     refuse_thresholds(options)
     _refuse_numbers(options)
     detector, settings = cli.detector_of(options, options.crop, options.set)
@@ -216,7 +224,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 def _refuse_numbers(options: argparse.Namespace) -> None:
     """Raise UserError for a number that is not above 0."""
-    numbers = [("targets", options.targets), ("hit-radius", options.hit_radius)]
+    numbers = [("targets", options.targets)]
     for frame_count in options.frames or ():
         numbers.append(("frames", frame_count))
     for name, number in numbers:
@@ -336,7 +344,9 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
 
     width_mm = max(float(scan.size_m[0]) for scan in scans) / MM
     height_mm = max(float(scan.size_m[1]) for scan in scans) / MM
-    apart_mm = options.apart or 2 * options.hit_radius + 10
+    length_mm = options.lengths[1] if options.lengths else 0.0
+    widest_mm = math.hypot(options.diameters[1], length_mm)
+    apart_mm = options.apart or max(2 * options.hit_radius, widest_mm) + ROOM_MM
     room = FILLED * min(scan.area_m2 for scan in scans) / (math.pi / 4 * (apart_mm * MM) ** 2)
     damage = {"kind": options.damage, "per_board": max(1, min(MOST_AT_ONCE, int(room)))}
     size_name = "width_mm" if options.damage == "slot" else "diameter_mm"
@@ -347,12 +357,9 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
         damage["length_mm"] = list(options.lengths)
     wavelength_nm = camera_of(CameraConfig(name=options.camera)).optics.wavelength_nm
     albedos = {"wavelength_nm": wavelength_nm, "board": options.albedo, "backing": options.albedo}
-    try:
-        backing = None if options.backing == "none" else {"distance_mm": float(options.backing)}
-    except ValueError as error:
-        raise UserError(
-            f"--backing {options.backing}: is not a number", legal="millimetres, or none"
-        ) from error
+    backing_mm = None if options.backing == "none" else in_unit(options.backing, "mm")
+    if backing_mm is None and options.backing != "none":
+        raise UserError(f"--backing {options.backing}: is not a length", legal=f"{LEGAL}, or none")
     data = {
         "seed": options.seed,
         "damage": damage,
@@ -360,7 +367,7 @@ def _family(options: argparse.Namespace, scans: list[Scan]) -> DrawnTargetConfig
         "apart_mm": apart_mm,
         "edge_mm": 1.0,
         "material": {"albedo_850": options.albedo, "grain_contrast": 0.0},
-        "backing": backing and {**backing, "albedo_850": options.albedo},
+        "backing": backing_mm and {"distance_mm": backing_mm, "albedo_850": options.albedo},
         "room": None,
         "other_wavelengths": [albedos],
     }

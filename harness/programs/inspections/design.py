@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lengths import LEGAL, UNITS_M, in_unit, states_unit
 from harness.vocabulary.program import program
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ MOST = 10_000
 def _options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     put = parser.add_argument_group("the assumed curve, given or read from a study").add_argument
-    put("--a50", type=float, metavar="SIZE", help="size that is found half the time")
-    put("--a90", type=float, metavar="SIZE", help="size that is found nine times out of ten")
+    put("--a50", metavar="SIZE", help="size that is found half the time")
+    put("--a90", metavar="SIZE", help="size that is found nine times out of ten")
     put("--link", choices=LINKS, help="shape of the curve (default: logit)")
     put("--log", action="store_true", default=None, help="use the logarithm of the sizes")
     put(
@@ -39,12 +40,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--sizes",
-        type=float,
-        nargs=2,
-        metavar=("FROM", "TO"),
+        metavar="FROM:TO",
         help="sizes to choose from (default: the study's)",
     )
-    add("--unit", help="unit of all sizes, for the labels (default: mm)")
+    add("--unit", help="unit of bare sizes, and of the labels (default: mm)")
     add(
         "--targets",
         type=int,
@@ -54,7 +53,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="default: 30 40 60 120",
     )
     goal = "the wanted a90/95: recommend the fewest targets that reach it reliably"
-    add("--goal", type=float, metavar="SIZE", help=goal)
+    add("--goal", metavar="SIZE", help=goal)
     add(
         "--studies",
         type=int,
@@ -88,8 +87,9 @@ Guess = tuple["PodCurve", str, tuple[float, float], float | None]
     "Plan a hit/miss study from a guess of its probability of detection curve: simulate studies, "
     "analyse them like real ones, and state which a90/95 to expect, how many targets it takes, "
     "and which sizes to make.",
-    epilog="example: tofpod design --a50 5 --a90 7 --sizes 2 12 --goal 9. A simulated study "
-    "takes about 40 ms.",
+    "tofpod design --a50 5 --a90 7 --sizes 2:12",
+    "tofpod design --a50 5 --a90 7 --sizes 2:12 --goal 9",
+    epilog="A simulated study takes about 40 ms.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no plan shows a limit), 2 for a user's mistake, 130
@@ -107,6 +107,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.vocabulary.text import show
 
     _refuse_what_does_not_belong(options)
+    _read_sizes(options)
     guess = _guess(options)
     _check(options, guess)
     curve, origin, sizes, board_m2 = guess
@@ -151,7 +152,7 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         )
     missing = [f"--{name}" for name in ("a50", "a90", "sizes") if getattr(options, name) is None]
     if options.study is None and missing:
-        legal = "--a50 SIZE --a90 SIZE --sizes FROM TO, or --study DIR"
+        legal = "--a50 SIZE --a90 SIZE --sizes FROM:TO, or --study DIR"
         fix = (
             "make a careful guess; a study that is planned for an optimistic guess demonstrates "
             "nothing"
@@ -162,6 +163,32 @@ def _refuse_what_does_not_belong(options: argparse.Namespace) -> None:
         owner_value = getattr(options, owner.replace("-", "_"))
         if value is not None and owner_value is None:
             raise UserError(f"--{name} belongs to --{owner}", fix=f"add --{owner}, or leave it out")
+
+
+def _read_sizes(options: argparse.Namespace) -> None:
+    """Replace the texts of sizes by numbers in --unit. Raises UserError for what is no size."""
+    unit = options.unit or "mm"
+
+    def size(option: str, text: str) -> float:
+        value = in_unit(text, unit if unit in UNITS_M else "mm")
+        if value is None or (states_unit(text) and unit not in UNITS_M):
+            legal = f"a number in {unit}"
+            if unit in UNITS_M:
+                legal += f", or a length with a unit, {LEGAL}"
+            raise UserError(f"--{option} {text}: is not a size", legal=legal)
+        return value
+
+    for name in ("a50", "a90", "goal"):
+        text = getattr(options, name)
+        if text is not None:
+            setattr(options, name, size(name, text))
+    if options.sizes is not None:
+        ends = options.sizes.split(":")
+        if len(ends) != 2:
+            raise UserError(
+                f"--sizes {options.sizes}: is not a range", legal="FROM:TO, such as 2:12"
+            )
+        options.sizes = tuple(size("sizes", end) for end in ends)
 
 
 def _guess(options: argparse.Namespace) -> Guess:
@@ -180,7 +207,7 @@ def _guess(options: argparse.Namespace) -> Guess:
     limit = limit_of(record)
     if limit.statement is None:
         fix = (
-            "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM TO; or name "
+            "state a guess instead of --study: --a50 SIZE --a90 SIZE --sizes FROM:TO; or name "
             "another set-up"
         )
         raise UserError(f"{options.study}: {record.label} has no curve: {limit.why}", fix=fix)
@@ -202,7 +229,7 @@ def _check(options: argparse.Namespace, guess: Guess) -> None:
     rules = (
         (
             0 <= low < high < float("inf"),
-            f"--sizes {low:g} {high:g}: not a range",
+            f"--sizes {low:g}:{high:g}: not a range",
             "0 <= FROM < TO",
         ),
         (

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.programs.inspections.gauge_read import READ
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.program import program, span
+from harness.vocabulary.program import length, program, span
 
 if TYPE_CHECKING:
     from harness.evaluation.pod.curve import PodCurve
@@ -37,15 +37,15 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "--diameters",
         required=True,
-        type=span,
+        type=span("mm"),
         metavar="FROM:TO",
-        help="range of drill diameters, mm",
+        help="range of drill diameters (bare numbers: mm)",
     )
     add(
         "--depths",
-        type=span,
+        type=span("mm"),
         metavar="FROM:TO",
-        help="depths of blind holes, mm (default: all are through-holes)",
+        help="depths of blind holes (bare: mm; default: all are through-holes)",
     )
     add(
         "--study",
@@ -56,24 +56,29 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("--set-up", metavar="NAME", help='set-up of that study: "50 frames"')
     add(
         "--a50",
-        type=float,
-        metavar="MM",
-        help="plan with a guess: the size that is found half the time",
+        type=length("mm"),
+        metavar="SIZE",
+        help="plan with a guess: the size that is found half the time (bare: mm)",
     )
-    add("--a90", type=float, metavar="MM", help="and the size that is found nine times out of ten")
+    add(
+        "--a90",
+        type=length("mm"),
+        metavar="SIZE",
+        help="and the size that is found nine times out of ten (bare: mm)",
+    )
     add("--targets", type=int, default=36, metavar="N", help="total number of holes (default: 36)")
     add(
-        "--board",
+        "--board-size",
         default="270x175",
         metavar="WxH",
         help="size of a board, mm (default: 270x175, one sheet of A4)",
     )
     add(
         "--apart",
-        type=float,
+        type=length("mm"),
         default=30.0,
-        metavar="MM",
-        help="distance between holes (default: 30)",
+        metavar="LENGTH",
+        help="distance between holes (bare: mm; default: 30)",
     )
     add("--paper", choices=("A4", "A3", "letter"), default="A4", help="default: A4")
     add(
@@ -90,9 +95,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Design gauge boards with coded corner marks and holes of evenly spread sizes, and state the "
     "limit that tofpod design expects of them. Write template.pdf (1:1, in tiles of the paper), "
     "an SVG for each board, and gauge.json, the truth that tofpod gauge read needs.",
-    epilog="example: tofpod gauge --diameters 2:12 --study results/implant --set-up '50 "
-    "frames' --out gauge, then drill, record, and tofpod gauge read captures/gauge --gauge "
-    "gauge/gauge.json --out found",
+    "tofpod gauge --diameters 2:12 --a50 4 --a90 6 --out gauge",
+    "tofpod gauge --diameters 2:12 --study results/implant --set-up '50 frames' --out gauge",
+    epilog="The holes are drilled, the board is recorded, and tofpod gauge read finds them.",
     further={"read": READ},
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -178,12 +183,12 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
     from harness.vocabulary.seeds import random_stream
 
     try:
-        width, height = map(float, options.board.lower().split("x"))
+        width, height = map(float, options.board_size.lower().split("x"))
         if not all(0 < length_mm < LARGEST_MM for length_mm in (width, height)):
             raise ValueError("no size of a board")
     except ValueError as error:
         raise UserError(
-            f"--board {options.board}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
+            f"--board-size {options.board_size}: is not a size", legal="WIDTHxHEIGHT in mm: 270x175"
         ) from error
     side = MARK_MM
     spacing = options.apart
@@ -209,7 +214,7 @@ def _laid_out(options: argparse.Namespace, sizes: np.ndarray) -> Gauge:
                 free_mm.append((x, y))
     count = -(-len(sizes) // max(len(free_mm), 1))
     if not free_mm or min(inset.min(), room.min()) <= side or 4 * count > CODES:
-        fix = "a larger --board, a smaller --apart, or fewer --targets"
+        fix = "a larger --board-size, a smaller --apart, or fewer --targets"
         raise UserError(
             f"{len(sizes)} holes need {count} boards of {width:g} x {height:g} mm", fix=fix
         )

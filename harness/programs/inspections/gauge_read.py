@@ -51,5 +51,8 @@ READ = Program(
     description="Find the boards of a gauge in a capture by their marks, inspect the capture as "
     "tofpod detect does, and count which holes are hit. Write the findings, and hits and misses "
     "to gauge.csv, which tofpod pod reads.",
-    epilog="example: tofpod gauge read captures/gauge --gauge gauge/gauge.json --out found",
+    examples=(
+        "tofpod gauge read captures/gauge --gauge gauge/gauge.json",
+        "tofpod gauge read captures/gauge --gauge gauge/gauge.json --detector matched --out found",
+    ),
 )

@@ -96,7 +96,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Fit a probability of detection curve to inspections, one per row of a table, and state the "
     "size that is found 90 % of the time with 95 % confidence (a90/95). Write pod.json, pod.png "
     "and pod.html.",
-    epilog="example: tofpod pod blades.csv --hit found --size length --target blade --unit mm",
+    "tofpod pod inspections.csv --hit found --size length --unit mm",
+    "tofpod pod inspections.csv --ahat depth --decision 0.8 --size length_mm --out pod",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if no limit is demonstrated), 2 for a user's mistake, 130

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import size_text
-from harness.vocabulary.program import program
+from harness.vocabulary.program import bytes_of, program
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -19,13 +19,14 @@ def _options(parser: argparse.ArgumentParser) -> None:
     name_help = "name of the results, as listed by tofpod ls results"
     add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=name_help)
     add(
-        "--limit",
+        "--cache-limit",
+        type=bytes_of,
         metavar="SIZE",
-        help="cache: remove the longest unused renders until the rest fits, such as 5GB",
+        help="cache: remove the longest unused renders until the rest fits, such as 5GB (bare: GB)",
     )
     add("--all", action="store_true", help="cache: remove all renders")
     add(
-        "--out",
+        "--results",
         type=Path,
         default=Path("results"),
         metavar="DIR",
@@ -37,17 +38,16 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Remove stored renders or results. Only files that tofpod wrote below --out are "
+    "Remove stored renders or results. Only files that tofpod wrote below --results are "
     "removed, links are never "
     "followed, and files of a running sweep are kept.",
-    epilog="examples: tofpod clean cache --limit 5GB; "
-    "tofpod clean results averaging/69346a82f4194e03 --dry-run",
+    "tofpod clean cache --cache-limit 5GB",
+    "tofpod clean results averaging --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for
     a user's mistake."""
     from harness.programs.keeping.listing import (
-        bytes_of,
         cache_removal,
         chosen_results,
         refuse_links,
@@ -58,21 +58,25 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.render.cache import removed
 
     of_results = options.what == "results"
-    limit = None if options.limit is None else bytes_of(options.limit)
+    limit = options.cache_limit
     if of_results and (limit is not None or options.all):
-        raise UserError("--limit and --all are for the cache", legal="clean results NAME[/DIGEST]")
+        raise UserError(
+            "--cache-limit and --all are for the cache", legal="clean results NAME[/DIGEST]"
+        )
     if options.name and not of_results:
         raise UserError(
             f"the cache has no part called {options.name!r}",
-            legal="clean cache --limit SIZE, or --all",
+            legal="clean cache --cache-limit SIZE, or --all",
         )
     if of_results:
-        folders = chosen_results(options.out, options.name)
+        folders = chosen_results(options.results, options.name)
         print("\n".join(map(str, folders)))
     else:
-        folders = [options.out / ".cache" / "renders"]
+        folders = [options.results / ".cache" / "renders"]
         if (limit is None) != options.all:
-            raise UserError("no renders are selected for removal", legal="--limit SIZE, or --all")
+            raise UserError(
+                "no renders are selected for removal", legal="--cache-limit SIZE, or --all"
+            )
         if not folders[0].is_dir():
             print(f"{folders[0]}: there is no cache")
             return 0

@@ -1,4 +1,4 @@
-"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--out``,
+"""Finds what `tofpod ls` lists and `tofpod clean` removes: tofpod's own entries in ``--results``,
 never behind a link."""
 
 import contextlib
@@ -39,18 +39,6 @@ from harness.vocabulary.seeds import canonical_json
 from harness.vocabulary.text import Grid, many
 from scenes.render.cache import StoredFile, leftovers, longest_unused, stored_renders
 from scenes.sensor.camera import CAMERAS, load_camera, number_paths
-
-BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}  # powers of ten, as disks are sold
-
-
-def bytes_of(text: str) -> int:
-    """Read a size such as ``5GB`` or ``500 MB``. Raises UserError."""
-    match = re.fullmatch(r"([0-9]{1,12}(?:\.[0-9]{1,6})?) ?([A-Za-z]{1,3})", text.strip())
-    factors = {unit.lower(): factor for unit, factor in BYTES.items()}
-    if match is None or match[2].lower() not in factors:
-        raise UserError(f"{text!r} is not a size", legal="such as 500MB, 5GB or 1.5TB")
-    return round(float(match[1]) * factors[match[2].lower()])
-
 
 Row = Mapping[str, Any]
 SETTABLE = {

@@ -30,7 +30,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a detector or camera, to show all its settings; with results, the experiment",
     )
     add(
-        "--out",
+        "--results",
         type=Path,
         default=Path("results"),
         metavar="DIR",
@@ -45,9 +45,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "through the entry point "
     "groups tofpod.detectors and tofpod.cameras. Or list results folders, the cache of "
     "renders, the age of stored answers (artefacts), or all keys of an experiment.",
-    epilog="examples: tofpod ls; tofpod ls thesis; tofpod ls cameras kinect_v2; "
-    "tofpod ls --json; tofpod ls results; tofpod ls results averaging; "
-    "tofpod ls cache; tofpod ls artefacts",
+    "tofpod ls cameras kinect_v2",
+    "tofpod ls thesis",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 (also if something listed is broken), 2 for a user's mistake."""
@@ -118,13 +117,13 @@ def _list_results(options: argparse.Namespace) -> int:
     from harness.programs.keeping.listing import differs_text, limit_text, result_folders
     from harness.vocabulary.text import Grid
 
-    folders = result_folders(options.out, options.name)
+    folders = result_folders(options.results, options.name)
     if options.name is not None and not folders:
         fix = "run tofpod ls results for a list"
-        raise UserError(f"{options.out}: has no results of {options.name!r}", fix=fix)
+        raise UserError(f"{options.results}: has no results of {options.name!r}", fix=fix)
     if options.json:
         return _print_json(folders)
-    print(f"results in {options.out}" + ("" if folders else ": none"))
+    print(f"results in {options.results}" + ("" if folders else ": none"))
     for name in sorted({run["experiment"] for run in folders}):
         print(f"  {name}")
         shown = [run for run in folders if run["experiment"] == name]
@@ -147,7 +146,7 @@ def _list_cache(options: argparse.Namespace) -> int:
 
     if options.name is not None:
         raise UserError(f"the cache has no part called {options.name!r}", fix="tofpod ls cache")
-    folder = options.out / ".cache" / "renders"
+    folder = options.results / ".cache" / "renders"
     renders = stored_renders(folder)
     leftover_files = leftovers(folder)
     size_bytes = sum(file.size_bytes for file in renders)

@@ -8,7 +8,7 @@ from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
 
-@program(lambda parser: None, "Compile the inner loops once.")
+@program(lambda parser: None, "Compile the inner loops once.", "tofpod prepare")
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the loops of single views on small captures, in two processes; map loops compile at
     first use. Returns 0."""

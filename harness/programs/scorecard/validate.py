@@ -48,7 +48,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="frames of a static scene, as read by tofpod detect",
     )
     add_reading(put)
-    put("--frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
+    put("--max-frames", type=whole_number(4096), metavar="N", help="use only the first N frames")
     put(
         "--mask",
         type=Path,
@@ -75,6 +75,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Measure the simulated cameras like real cameras, and compare each published figure with the "
     "simulated figure. With --capture: compare a real capture of a static scene with the "
     "simulation of the planes and edges in it.",
+    "tofpod validate --camera azure_kinect_nfov",
+    "tofpod validate --capture captures/wall --camera azure_kinect_nfov",
     epilog="The exit code is 1 if a figure or a family of figures fails and its entry in the file "
     "gives no reason, or if --power finds other untested constants than are on file.",
 )
@@ -99,16 +101,17 @@ def main(options: argparse.Namespace, command: str) -> int:
             )
         reading = {
             **reading_of(options),
-            "frames": slice(options.frames) if options.frames else None,
+            "frames": slice(options.max_frames) if options.max_frames else None,
         }
         recording = (
             opened(options.capture, options.intrinsics, **reading) if options.capture else None
         )
         return run_board(options, recording, command)
-    for name in (*READING, "intrinsics", "frames", "mask"):
+    for name in (*READING, "intrinsics", "max_frames", "mask"):
         if getattr(options, name) is not None:
             raise UserError(
-                f"--{name} belongs to a capture, but none is named", fix="add --capture PATH"
+                f"--{name.replace('_', '-')} belongs to a capture, but none is named",
+                fix="add --capture PATH",
             )
     from harness.programs.scorecard.program import run_scorecard
 

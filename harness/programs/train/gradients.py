@@ -134,7 +134,7 @@ def parameters_of(network: Network) -> list[np.ndarray]:
 
 
 @dataclass
-class Descent:
+class AdamDescent:
     """The steps of Adam, which change a network's arrays in place."""
 
     network: Network

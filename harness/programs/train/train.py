@@ -35,7 +35,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "detector with a network",
     )
     change = "change a value of the file, such as study.boards=20; may be repeated"
-    add("--set", dest="overrides", metavar="PATH=VALUE", action="append", default=[], help=change)
+    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
     add("--out", type=Path, required=True, metavar="FILE", help="the network's file, .npz")
     passes = "how often each picture is shown (default: 6)"
     add("--passes", type=whole_number(MOST_PASSES), default=6, metavar="N", help=passes)
@@ -51,6 +51,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Train the network of the detector `learned` on the damaged boards of an experiment: all its "
     "cameras, numbers of frames and kinds of damage. The same file, seed and machine give the "
     "same weights.",
+    "tofpod train training --out network.npz",
+    "tofpod train training --set study.boards=20 --passes 3 --out network.npz",
     epilog="Name the file in an experiment: detector: {name: learned, settings: {network: "
     "network.npz}}. Train on other boards and units than those that are judged.",
 )
@@ -145,14 +147,14 @@ def _trained(
 ) -> tuple[Network, list[list[float]]]:
     """Return the network, and the mean loss of each pass on the pictures trained on and on those
     held out."""
-    from harness.programs.train.gradients import Descent, gradient_of, loss_of, new_network
+    from harness.programs.train.gradients import AdamDescent, gradient_of, loss_of, new_network
     from harness.programs.train.pictures import example_of, prior_of
     from harness.vocabulary.seeds import random_stream
 
     shown = [picture for picture in pictures if picture.board % HELD_OUT != HELD_OUT - 1]
     held_out = [picture for picture in pictures if picture.board % HELD_OUT == HELD_OUT - 1]
     network = new_network(channels, prior_of(shown), random_stream(seed, "weights"))
-    descent = Descent(network, passes * len(shown))
+    descent = AdamDescent(network, passes * len(shown))
     losses = []
     for number in range(passes):
         stream = random_stream(seed, "pass", number)

@@ -21,6 +21,7 @@ from harness.vocabulary.declaration.yaml_source import (
     Source,
 )
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lengths import LEGAL, unit_of_key
 from harness.vocabulary.words import nearest
 
 YES_AND_NO = {"yes": "true", "on": "true", "no": "false", "off": "false"}
@@ -179,9 +180,14 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     if kind == "extra_forbidden":
         within = path[:-1]
         taken = shape.get(source.data, within)
-        return unknown_key(
+        problem = unknown_key(
             str(path[-1]), within, declared.names(within), source.key_place_of(path), taken
         )
+        home = _home_of(path, declared)
+        if home is None or problem.nearest is not None:
+            return problem
+        around = f"of `{dotted(home)}`" if home else "at the left margin"
+        return replace(problem, fix=f"indent `{path[-1]}` as the keys {around}, where it belongs")
     if kinds and not isinstance(value, dict):
         message = f"`{dotted(path)}` is {shown(value)}, not a mapping"
         return Problem(
@@ -213,6 +219,9 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
         "list_type",
     ):
         return Problem(f"`{dotted(path)}` is {shown(value)}", position, legal)
+    unit = next((unit_of_key(key) for key in reversed(path) if isinstance(key, str)), None)
+    if kind == "float_type" and unit is not None and isinstance(value, str):
+        legal = f"{legal or 'a number'}, in {unit}; or a length with a unit, {LEGAL}"
     if kind.startswith("int_") and isinstance(value, float) and value.is_integer():
         fix = f"write {int(value)} without a decimal point or exponent"
     if kind.startswith("bool_") and str(value).lower() in YES_AND_NO:
@@ -223,6 +232,20 @@ def _problem(path: KeyPath, error: Any, declared: shape.Declared, source: Source
     return Problem(
         f"`{dotted(path)}` is {shown(value)}: {text[0].lower()}{text[1:]}", position, legal, fix=fix
     )
+
+
+def _home_of(path: KeyPath, declared: shape.Declared) -> KeyPath | None:
+    """Return the mapping nearby that has the last key of a path, where a wrong indentation has
+    taken it from: one around the path's own mapping, beside it or within it; None without one."""
+    key = path[-1]
+    within = path[:-1]
+    homes = []
+    for legal in declared.paths():
+        mapping = legal[:-1]
+        is_near = mapping[: len(within) - 1] == within[:-1] and len(mapping) <= len(within) + 1
+        if legal[-1] == key and (is_near or within[: len(mapping)] == mapping):
+            homes.append(mapping)
+    return min(homes, key=lambda mapping: abs(len(mapping) - len(within)), default=None)
 
 
 def dotted(path: Sequence[str | int]) -> str:

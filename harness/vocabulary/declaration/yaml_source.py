@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from ruamel.yaml.parser import Parser
 from ruamel.yaml.reader import ReaderError
 
 from harness.vocabulary.errors import UserError
+from harness.vocabulary.lengths import converted
+from harness.vocabulary.words import nearest
 
 # Characters of a source line that a message shows; longer lines are cut around the caret
 SHOWN_COLUMNS = 110
@@ -136,6 +139,19 @@ KeyPath = tuple[
 MAX_BYTES = 500_000
 MAX_NODES = 50_000  # Values after aliases are expanded; this stops an alias bomb
 MAX_DEPTH = 40  # Levels of nesting; the schema needs 8
+INDENTATION = {
+    r"'\t'": "indent with spaces, not with tabs",
+    "expected <block end>": "let all keys of a mapping begin in the same column",
+    "mapping values are not allowed": (
+        "write the keys that belong to a key on lines of their own, indented further; put quotes "
+        "around text with a colon"
+    ),
+}
+"""What to do about the parser's messages that a wrong indentation causes."""
+NAMING = ("path", "key")
+"""Keys of variations and of unknowns that name another key."""
+NAMED = ("values", "range")
+"""Keys beside these with values of the key that is named."""
 _TAG = "tag:yaml.org,2002:"
 _OTHER_VERSION = re.compile(r"^%YAML[ \t]+(?!1\.2\b).*", re.MULTILINE)
 
@@ -195,6 +211,7 @@ def read_yaml(path: Path) -> Source:
     path = Path(path)
     position = None
     legal = None
+    meant = None
     fix = None
     try:
         with path.open("rb") as stream:
@@ -216,6 +233,7 @@ def read_yaml(path: Path) -> Source:
             sorted(str(file) for file in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
         )
         message = "there is no such file"
+        meant = nearest(path, yaml_files)
         legal = ", ".join(yaml_files[:10]) or None
     except IsADirectoryError:
         message = "this is a folder, not a YAML file"
@@ -227,13 +245,16 @@ def read_yaml(path: Path) -> Source:
         position = Place(str(path), len(lines), len(lines[-1]) + 1, lines[-1] + undecodable)
         message = f"byte 0x{content[error.start]:02x} is not UTF-8"
         fix = "save the file as UTF-8"
-    raise DeclarationError(str(path), [Problem(message, position, legal=legal, fix=fix)])
+    raise DeclarationError(str(path), [Problem(message, position, legal, meant, fix)])
 
 
-def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = False) -> Source:
+def parse_yaml(
+    text: str, origin: str, *, start: int = 0, is_argument: bool = False, key: str = ""
+) -> Source:
     """Parse ``text[start:]``; places refer to the whole text. ``is_argument`` says that the text
-    is an argument of the command line, so that places have no line number. Raises
-    DeclarationError."""
+    is an argument of the command line, so that places have no line number; ``key`` is the key
+    whose value the text is. Lengths with a unit become numbers in the unit that their key's name
+    states: ``distance_m: 90cm`` is 0.9. Raises DeclarationError."""
     starts = [0, *(match.end() for match in re.finditer("\n", text))]
     lines = text.split("\n")
 
@@ -254,7 +275,7 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
     try:
         root = reader.compose(text[start:])
         builder = _Builder(place)
-        data = None if root is None else builder.build(root, (), ())
+        data = None if root is None else converted(key, builder.build(root, (), ()))
         if not builder.problems:
             return Source(origin, text, data, {(): place(0, 0), **builder.values}, builder.keys)
         raise DeclarationError(origin, builder.problems)
@@ -271,8 +292,9 @@ def parse_yaml(text: str, origin: str, *, start: int = 0, is_argument: bool = Fa
             else None
         )
         what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
+        fix = next((fix for said, fix in INDENTATION.items() if said in what), None)
         problem = Problem(
-            f"not valid YAML: {what}", where, other=begun, other_says="which began at"
+            f"not valid YAML: {what}", where, fix=fix, other=begun, other_says="which began at"
         )
     except ReaderError as error:
         index = int(error.position)
@@ -371,7 +393,7 @@ class _Builder:
             key = self._scalar(key_node, key_place) if isinstance(key_node, ScalarNode) else None
             if isinstance(key, str) and key not in result:
                 self.keys[(*path, key)] = key_place
-                result[key] = self.build(value_node, (*path, key), within)
+                result[key] = converted(key, self.build(value_node, (*path, key), within))
             elif isinstance(key, str):
                 first = self.keys[(*path, key)]
                 message = f"duplicate key `{key}`"
@@ -386,6 +408,9 @@ class _Builder:
                 )
             elif len(self.problems) == before:
                 self._refuse("a key must be text", key_place, "text; put quotes around numbers")
+        for naming, values in product(NAMING, NAMED):
+            if values in result and isinstance(result.get(naming), str):
+                result[values] = converted(result[naming], result[values])
         return result
 
     def _scalar(self, node: Node, position: Place) -> Any:

@@ -365,3 +365,40 @@ def test_settings_below_a_key_are_told_with_their_whole_path() -> None:
     assert '`mapping.registration.method` is "ipc"' in str(
         caught.value
     ) and "did you mean: icp" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "fix"),
+    [
+        ("name: a\nfinish: matte\n", "indent `finish` as the keys of `board`, where it belongs"),
+        ("board: {name: a}\n", "indent `name` as the keys at the left margin, where it belongs"),
+        ("name: a\nboard: {}\nnothing: 3\n", None),
+    ],
+)
+def test_a_key_that_is_indented_wrongly(text: str, fix: str | None) -> None:
+    unknown = [message for message in messages(text) if "unknown key" in message]
+    assert len(unknown) == 1
+    assert unknown[0].partition("to do: ")[2] == (fix or "")
+
+
+@pytest.mark.parametrize(
+    ("text", "fix"),
+    [
+        ("board:\n  flag: true\n code: ab\n", "begin in the same column"),
+        ("board:\n\tflag: true\n", "indent with spaces, not with tabs"),
+        ("board: flag: true\n", "on lines of their own, indented further"),
+        ("board: [1\n", None),
+    ],
+)
+def test_yaml_whose_indentation_is_wrong(text: str, fix: str | None) -> None:
+    with pytest.raises(DeclarationError) as caught:
+        parse_yaml(text, "x.yaml")
+    (problem,) = caught.value.problems
+    assert (problem.fix is None) == (fix is None)
+    assert (fix or "") in (problem.fix or "")
+
+
+def test_a_file_that_is_not_there_has_the_nearest_name(tmp_path: Path) -> None:
+    (tmp_path / "panels.yaml").write_text("name: a\n")
+    with pytest.raises(DeclarationError, match=r"did you mean: .*panels\.yaml"):
+        read_yaml(tmp_path / "panel.yaml")

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from harness.vocabulary.program import Program
+from harness.vocabulary.program import Program, bytes_of
 
 THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -28,7 +28,7 @@ def seen_by_a_program(monkeypatch: pytest.MonkeyPatch, stated: str | None) -> li
             monkeypatch.delenv(name)
     monkeypatch.setattr(sys, "argv", ["tofpod"])
     monkeypatch.setattr("signal.signal", lambda number, handler: None)
-    program = Program("looks", lambda parser: None, run, "Looks at its environment.")
+    program = Program("looks", lambda parser: None, run, "Looks at its environment.", ())
     assert program() == 0
     return seen
 
@@ -39,3 +39,62 @@ def test_linear_algebra_takes_one_thread(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_a_stated_number_of_threads_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen_by_a_program(monkeypatch, stated="3") == ["3", "3"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--coulor", "red"], "--coulor: there is no such option; did you mean --colour?"),
+        (["--colour", "rde"], "--colour: 'rde' is none of its values; did you mean 'red'?"),
+        (["--colour", "rde"], "  legal: red, green"),
+        (["stray"], "stray: there is no such argument"),
+        (["--number", "x"], "--number: invalid int value: 'x'"),
+        (["--number"], "--number: expected one argument"),
+        ([], "the following arguments are required: --number"),
+    ],
+)
+def test_a_mistake_is_one_message(words: list[str], message: str, capsys) -> None:
+    def options(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--colour", choices=("red", "green"))
+        parser.add_argument("--number", type=int, required=True)
+
+    program = Program("paints", options, lambda parsed, command: 0, "Paints.", ())
+    given = words if words[:1] in ([], ["--number"]) else ["--number", "1", *words]
+    with pytest.raises(SystemExit, match="2"):
+        program(given)
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.startswith("error: ")
+    assert printed.endswith("to do: tofpod paints --help shows all options\n")
+    assert "usage" not in printed and len(printed.splitlines()) <= 3
+
+
+def test_a_mistyped_further_program_is_not_taken_for_arguments(capsys) -> None:
+    further = Program("gauge read", lambda parser: None, lambda parsed, command: 0, "Reads.", ())
+    gauge = Program(
+        "gauge",
+        lambda parser: None,
+        lambda parsed, command: 1,
+        "Designs.",
+        (),
+        further={"read": further},
+    )
+    assert gauge(["read"]) == 0
+    assert gauge([]) == 1
+    with pytest.raises(SystemExit, match="2"):
+        gauge(["raed"])
+    assert "raed: there is no such argument; did you mean read?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("5GB", 5_000_000_000), ("5", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0)],
+)
+def test_sizes_in_memory(text: str, count: int) -> None:
+    assert bytes_of(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-5GB", "5 gigs", "1e3GB", "nan", "5GBx", "５GB"])
+def test_what_is_no_size(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="not a size"):
+        bytes_of(text)

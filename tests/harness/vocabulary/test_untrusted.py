@@ -251,10 +251,11 @@ def test_a_mask_that_states_more_pixels_than_a_picture_has(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "9" * 10_000, "[1, 2"])
-def test_a_setting_that_is_no_json_is_text(text):
+def test_a_setting_that_is_no_yaml_is_refused(text):
     settings: dict[str, object] = {}
-    assign(settings, f"a.b={text}")
-    assert settings == {"a": {"b": text}}
+    message = refusal(lambda: assign(settings, f"a.b={text}"))
+    assert message.startswith("--set: 1 problem") and len(message) < 1000
+    assert settings == {}
 
 
 # ---- names

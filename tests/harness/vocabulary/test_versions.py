@@ -186,6 +186,6 @@ def test_a_file_of_poses(tmp_path, version, told):
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_design_says_it(tmp_path):
-    asked = ["--a50", "6", "--a90", "8", "--sizes", "4", "10", "--studies", "10", "--targets", "60"]
+    asked = ["--a50", "6", "--a90", "8", "--sizes", "4:10", "--studies", "10", "--targets", "60"]
     assert design.main([*asked, "--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "design.json").read_text())["results_version"] == RESULTS_VERSION

@@ -49,7 +49,7 @@ def test_the_plane_lies_about_the_axis_and_its_noise_is_over_frames(
     assert unit.view.range_m.min() > 1.15
     frames = np.array([[[1.0, 2.0]], [[1.0, 4.0]], [[1.0, 9.0]]])
 
-    class Frame:
+    class RangeFrame:
         def __init__(self, z_m: np.ndarray) -> None:
             self.z_m = z_m
 
@@ -58,8 +58,8 @@ def test_the_plane_lies_about_the_axis_and_its_noise_is_over_frames(
             assert (count, seed, label) == (3, 9, "calibration")
             return self
 
-        def frames(self) -> list[Frame]:
-            return [Frame(z_m) for z_m in frames]
+        def frames(self) -> list[RangeFrame]:
+            return [RangeFrame(z_m) for z_m in frames]
 
     monkeypatch.setattr(calibration, "unit_before_plane", lambda *_: Unit())
     variance = np.var([2.0, 4.0, 9.0], ddof=1)

@@ -79,7 +79,7 @@ def test_words_for_damage(atlas: Path, capsys: pytest.CaptureFixture[str]):
     for word in ("crack", "slot", "scratch"):
         output = said(f"--damage {word} --size 3mm --depth 4mm --distance 1m", atlas, capsys)
         assert output.startswith("Crack or slots of 3 mm, 4 mm deep, at 1 m")
-    assert "A scratch is answered as a slot" in output
+    assert "A scratch (gouge) is answered as a slot" in output
 
 
 def test_page_and_table_say_the_same_and_open_at_the_question(

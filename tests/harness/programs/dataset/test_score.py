@@ -17,7 +17,7 @@ from harness.programs.dataset import score
 from harness.programs.gate import compare
 from tests.support.tiny_dataset import arrays_of, names_in, truth_of
 
-RATE = ("--false-calls", "100")
+RATE = ("--false-calls-per-m2", "100")
 
 
 @pytest.fixture
@@ -117,10 +117,10 @@ def test_a_higher_rate_of_false_calls_lowers_the_threshold_and_too_few_boards_ar
 ):
     thresholds = []
     for rate in (100, 400):
-        assert run(maps, folder, tmp_path / "out", "--false-calls", str(rate)) == 0
+        assert run(maps, folder, tmp_path / "out", "--false-calls-per-m2", str(rate)) == 0
         thresholds.append(read_record(tmp_path / "out").set_ups[0].threshold)
     assert thresholds[1] < thresholds[0]
-    assert run(maps, folder, tmp_path / "out", "--false-calls", "1") == 2
+    assert run(maps, folder, tmp_path / "out", "--false-calls-per-m2", "1") == 2
     assert "2 hole-free runs" in capsys.readouterr().err
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from harness.programs.dataset import export as exporting
 from harness.programs.implant import implant
 from harness.programs.implant.scans import Judging, Scan, damages_placed
 from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region
+from harness.vocabulary.words import damage_kind
 from scenes.closed_form import plane_view
 from scenes.implants import Implant, PartFace, implant_of, tangent_board, unit_config
 from scenes.optics import RenderConfig
@@ -252,7 +254,10 @@ def test_the_program_states_a_limit_of_a_recording(
 
     assert implant.main([*arguments, "--depths", "2:4", "--out", str(tmp_path / "no")]) == 2
     assert "depth_mm" in capsys.readouterr().err
-    for name in ("--targets", "--hit-radius", "--frames"):
+    with pytest.raises(SystemExit, match="2"):
+        implant.main([*arguments, "--hit-radius", "0"])
+    assert "--hit-radius: '0' is not a length" in capsys.readouterr().err
+    for name in ("--targets", "--frames"):
         assert implant.main([*arguments, name, "0", "--out", str(tmp_path / "no")]) == 2
         assert f"{name} 0" in capsys.readouterr().err
     arguments[arguments.index("2:14")] = "60:80"
@@ -315,3 +320,25 @@ def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
     implanted = limit_of(read_record(out).set_ups[0])
     assert simulated.a90_interval_mm.low < implanted.a90_interval_mm.high
     assert implanted.a90_interval_mm.low < simulated.a90_interval_mm.high
+
+
+@pytest.mark.parametrize(
+    ("words", "apart_mm"),
+    [
+        ("--damage hole --diameters 2:10", 40.0),
+        ("--damage through --diameters 3:6cm", 70.0),
+        ("--damage through --diameters 30:60 --apart 8cm", 80.0),
+        ("--damage hole --diameters 2:10 --hit-radius 30", 70.0),
+        ("--damage crack --diameters 3:30 --lengths 40:40 --depths 4:4", 60.0),
+    ],
+)
+def test_large_damage_lies_farther_apart(words: str, apart_mm: float) -> None:
+    """Ten millimetres more than two hit radii, and than the largest damage."""
+    options = implant.main.parser().parse_args(
+        ["captures", "--camera", "azure_kinect_nfov", *words.split()]
+    )
+    options.damage = damage_kind("--damage", options.damage, implant.DAMAGES)
+    scan = SimpleNamespace(size_m=np.array([0.8, 0.6]), area_m2=0.48)
+    family = implant._family(options, [scan])
+    assert family.apart_mm == apart_mm
+    assert family.damage.kind == options.damage

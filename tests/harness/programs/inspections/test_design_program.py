@@ -29,7 +29,7 @@ from harness.vocabulary.errors import UserError
 from tests.support.synthetic_study import AREA_M2, SetUp, Study, study_record
 
 GUESS = curve_through(5.0, 7.0)
-TOLD = ["--a50", "5", "--a90", "7", "--sizes", "2", "12"]
+TOLD = ["--a50", "5", "--a90", "7", "--sizes", "2:12"]
 FEW = ["--studies", "20", "--targets", "30", "60"]
 
 
@@ -185,8 +185,7 @@ def test_no_limit_at_all_is_said_and_drawn(
         "--a90",
         "40",
         "--sizes",
-        "5",
-        "8",
+        "5:8",
         "--studies",
         "10",
         "--targets",
@@ -221,12 +220,12 @@ def test_the_guess_from_a_study(study: Path, capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--a50", "7", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
-        (["--a50", "5", "--a90", "5", "--sizes", "2", "12"], "must grow with size"),
-        (["--a50", "nan", "--a90", "5", "--sizes", "2", "12"], "0 < a50 < a90"),
-        (["--a50", "5", "--a90", "7", "--sizes", "12", "2"], "FROM < TO"),
-        (["--a50", "5", "--a90", "7", "--sizes", "6", "12"], "do not include a50 = 5"),
-        (["--a50", "5", "--a90", "7", "--sizes", "0", "12", "--log"], "FROM above 0"),
+        (["--a50", "7", "--a90", "5", "--sizes", "2:12"], "0 < a50 < a90"),
+        (["--a50", "5", "--a90", "5", "--sizes", "2:12"], "must grow with size"),
+        (["--a50", "nan", "--a90", "5", "--sizes", "2:12"], "--a50 nan: is not a size"),
+        (["--a50", "5", "--a90", "7", "--sizes", "12:2"], "FROM < TO"),
+        (["--a50", "5", "--a90", "7", "--sizes", "6:12"], "do not include a50 = 5"),
+        (["--a50", "5", "--a90", "7", "--sizes", "0:12", "--log"], "FROM above 0"),
         (["--a90", "7"], "--a50, --sizes: not stated"),
         ([*TOLD, "--targets", "60", "9"], "--targets 9"),
         ([*TOLD, "--targets", "20000"], "10 to 10000"),

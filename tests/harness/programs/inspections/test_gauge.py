@@ -327,7 +327,7 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
             "diameter_mm",
             "--hit",
             "found",
-            "--board",
+            "--board-size",
             "board",
         ]
         arguments += [
@@ -357,10 +357,10 @@ def test_the_combined_limit_covers_the_truth_of_a_camera_that_the_study_has_wron
     [
         (["--a50", "5"], "exactly one curve"),
         (["--diameters", "12:2", "--a50", "5", "--a90", "7"], "--diameters"),
-        (["--a50", "5", "--a90", "7", "--board", "60x60"], "a larger --board"),
-        (["--a50", "5", "--a90", "7", "--board", "big"], "280x190|270x175"),
+        (["--a50", "5", "--a90", "7", "--board-size", "60x60"], "a larger --board-size"),
+        (["--a50", "5", "--a90", "7", "--board-size", "big"], "280x190|270x175"),
         (["--a50", "5", "--a90", "7", "--apart", "10"], "--apart"),
-        (["--a50", "5", "--a90", "7", "--board", "175xnan"], "280x190|270x175"),
+        (["--a50", "5", "--a90", "7", "--board-size", "175xnan"], "280x190|270x175"),
         (["--a50", "5", "--a90", "7", "--depths", "5:2"], "--depths 5:2"),
     ],
 )

@@ -15,12 +15,10 @@ import pytest
 
 from detectors import detector_type
 from harness.programs.keeping import clean, ls
-from harness.programs.keeping.listing import bytes_of
 from harness.runs.jobs import Ended
 from harness.runs.journal import Journal
 from harness.runs.results_folder import latest_run, point_to
 from harness.runs.shards import locked
-from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
@@ -52,7 +50,7 @@ def results(out: Path, digest: str, name: str = "study", records: int = 0, **sai
 
 
 def listed(capsys: pytest.CaptureFixture[str], out: Path, *more: str) -> dict[str, dict]:
-    assert ls.main(["results", *more, "--out", str(out), "--json"]) == 0
+    assert ls.main(["results", *more, "--results", str(out), "--json"]) == 0
     return {row["digest"]: row for row in json.loads(capsys.readouterr().out)}
 
 
@@ -116,13 +114,13 @@ def test_whatever_a_provenance_holds_the_list_goes_on(tmp_path, capsys, content)
     results(tmp_path, "1" * 16, trials={"done": 1})
     rows = listed(capsys, tmp_path)
     assert rows["1" * 16]["state"] == "complete" and len(rows) == 2
-    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+    assert ls.main(["results", "--results", str(tmp_path)]) == 0
 
 
 def test_the_list_as_text_fits_a_terminal(tmp_path, capsys):
     results(tmp_path, "0" * 16, trials={"done": 5, "resumed": 4, "failed": 0}, records=9)
     results(tmp_path, "2" * 16, records=3)
-    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+    assert ls.main(["results", "--results", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1] == "  study"
     assert lines[2].split() == [
@@ -147,7 +145,7 @@ def test_neither_links_nor_other_folders_are_results(tmp_path, capsys):
     (out / "baselines" / "regression.json").write_text("{}")
     assert listed(capsys, out) == {}
     assert listed(capsys, tmp_path / "nowhere") == {}
-    assert ls.main(["results", "nothing", "--out", str(out)]) == 2
+    assert ls.main(["results", "nothing", "--results", str(out)]) == 2
     assert "has no results of 'nothing'" in capsys.readouterr().err
 
 
@@ -171,15 +169,15 @@ def cache(tmp_path: Path) -> Path:
 
 
 def test_the_cache_is_counted(cache, tmp_path, capsys):
-    assert ls.main(["cache", "--out", str(tmp_path), "--json"]) == 0
+    assert ls.main(["cache", "--results", str(tmp_path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["renders"], facts["leftovers"]) == (3, 1)
     assert facts["size_bytes"] == sum(path.stat().st_size for path in cache.glob("[abc]*.npz"))
     assert facts["longest_unused_days"] == pytest.approx(40, abs=0.01)
-    assert ls.main(["cache", "--out", str(tmp_path)]) == 0
+    assert ls.main(["cache", "--results", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "40.0 days" in text
-    assert ls.main(["cache", "--out", str(tmp_path / "none")]) == 0
+    assert ls.main(["cache", "--results", str(tmp_path / "none")]) == 0
 
 
 def test_what_tells_runs_apart_and_the_limits_found_are_listed(tmp_path, capsys):
@@ -202,7 +200,7 @@ def test_what_tells_runs_apart_and_the_limits_found_are_listed(tmp_path, capsys)
         "a90_95_mm": 5.314,
     }
     assert rows["1" * 16]["is_latest"] and not rows["0" * 16]["is_latest"]
-    assert ls.main(["results", "--out", str(tmp_path)]) == 0
+    assert ls.main(["results", "--results", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[3] == "      a90/95 3.20 mm (near) to 5.31 mm (far, 1 frames)"
     assert lines[4] == "      frames=1, distance=0.1 m"
@@ -266,7 +264,7 @@ def test_a_latest_of_somebody_else_is_left_alone(tmp_path, capsys, kind):
     }[kind]()
     point_to(run)
     assert "was not written by tofpod" in capsys.readouterr().err
-    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert clean.main(["results", "study", "--yes", "--results", str(tmp_path)]) == 0
     assert os.path.lexists(theirs) and not run.exists()
 
 
@@ -275,10 +273,10 @@ def test_latest_neither_counts_twice_nor_outlives_its_run(tmp_path, capsys):
     second = results(tmp_path, "2" * 16, trials={"done": 1}, started="2026-11-22")
     point_to(second)
     assert set(listed(capsys, tmp_path)) == {first.name, second.name}
-    assert clean.main(["results", "study/latest", "--yes", "--out", str(tmp_path)]) == 2
-    assert clean.main(["results", f"study/{first.name}", "--yes", "--out", str(tmp_path)]) == 0
+    assert clean.main(["results", "study/latest", "--yes", "--results", str(tmp_path)]) == 2
+    assert clean.main(["results", f"study/{first.name}", "--yes", "--results", str(tmp_path)]) == 0
     assert latest_run(second.parent) == second.name
-    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert clean.main(["results", "study", "--yes", "--results", str(tmp_path)]) == 0
     assert not first.parent.exists()
 
 
@@ -292,14 +290,14 @@ def left_in(folder: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("arguments", "kept"),
     [
-        (["--limit", "0MB"], ""),
-        (["--limit", "1GB"], "abc"),
+        (["--cache-limit", "0MB"], ""),
+        (["--cache-limit", "1GB"], "abc"),
         (["--all"], ""),
         (["--all", "--dry-run"], "abc"),
     ],
 )
 def test_renders_go_by_size(cache, tmp_path, capsys, arguments, kept):
-    assert clean.main(["cache", *arguments, "--yes", "--out", str(tmp_path)]) == 0
+    assert clean.main(["cache", *arguments, "--yes", "--results", str(tmp_path)]) == 0
     leftover = {f".{'d' * 16}.abcd1234.part.npz"} if "--dry-run" in arguments else set()
     assert left_in(cache) == {"mine.txt", *(f"{letter * 16}.npz" for letter in kept), *leftover}
     printed = capsys.readouterr().out
@@ -308,7 +306,7 @@ def test_renders_go_by_size(cache, tmp_path, capsys, arguments, kept):
 
 def test_a_cache_in_use_is_refused(cache, tmp_path, capsys):
     with in_use(cache):
-        assert clean.main(["cache", "--all", "--yes", "--out", str(tmp_path)]) == 2
+        assert clean.main(["cache", "--all", "--yes", "--results", str(tmp_path)]) == 2
     assert "a sweep that is running uses these renders" in capsys.readouterr().err
     assert len(left_in(cache)) == 5
 
@@ -317,7 +315,7 @@ def test_a_cache_that_is_a_link_is_refused(cache, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / ".cache").symlink_to(cache.parent)
-    assert clean.main(["cache", "--all", "--yes", "--out", str(out)]) == 2
+    assert clean.main(["cache", "--all", "--yes", "--results", str(out)]) == 2
     assert "is a link" in capsys.readouterr().err and len(left_in(cache)) == 5
 
 
@@ -333,14 +331,14 @@ class Terminal:
 
 def test_nothing_is_removed_unasked(cache, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", Terminal(is_there=False))
-    assert clean.main(["cache", "--all", "--out", str(tmp_path)]) == 2
+    assert clean.main(["cache", "--all", "--results", str(tmp_path)]) == 2
     assert "--yes" in capsys.readouterr().err
     monkeypatch.setattr("sys.stdin", Terminal(is_there=True))
     for answer, code, count in (("", 1, 5), ("n", 1, 5), ("y", 0, 1)):
         monkeypatch.setattr("builtins.input", lambda _, answer=answer: answer)
-        assert clean.main(["cache", "--all", "--out", str(tmp_path)]) == code
+        assert clean.main(["cache", "--all", "--results", str(tmp_path)]) == code
         assert len(left_in(cache)) == count
-    assert clean.main(["cache", "--out", str(tmp_path)]) == 2
+    assert clean.main(["cache", "--results", str(tmp_path)]) == 2
 
 
 def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
@@ -358,9 +356,9 @@ def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
     (second / "notes.md").write_text("mine")
     (second / "journal" / "notes.md").write_text("mine")
     (second / "outside").symlink_to(tmp_path.parent)
-    assert clean.main(["results", "study", "--dry-run", "--out", str(tmp_path)]) == 0
+    assert clean.main(["results", "study", "--dry-run", "--results", str(tmp_path)]) == 0
     assert (first / "provenance.json").exists() and not (first / ".lock").exists()
-    assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 0
+    assert clean.main(["results", "study", "--yes", "--results", str(tmp_path)]) == 0
     assert not first.exists()
     assert {str(path.relative_to(second)) for path in second.rglob("*")} == {
         "notes.md",
@@ -376,7 +374,7 @@ def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
     stranger = tmp_path / "photos" / ("0" * 16)
     stranger.mkdir(parents=True)
     (stranger / "report.html").write_text("mine")
-    assert clean.main(["results", "photos", "--yes", "--out", str(tmp_path)]) == 2
+    assert clean.main(["results", "photos", "--yes", "--results", str(tmp_path)]) == 2
     assert "not a results folder" in capsys.readouterr().err
     assert (stranger / "report.html").read_text() == "mine"
 
@@ -385,7 +383,7 @@ def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
     first = results(tmp_path, "0" * 16, records=2)
     second = results(tmp_path, "1" * 16, records=2)
     with locked(second):
-        assert clean.main(["results", "study", "--yes", "--out", str(tmp_path)]) == 2
+        assert clean.main(["results", "study", "--yes", "--results", str(tmp_path)]) == 2
     assert "another sweep" in capsys.readouterr().err
     assert all(len(Journal(one / "journal")) == 2 for one in (first, second))
 
@@ -407,7 +405,7 @@ def test_a_running_sweep_keeps_all_results_that_were_named(tmp_path, capsys):
 )
 def test_names_that_name_no_results(tmp_path, capsys, name):
     results(tmp_path, "0" * 16, records=1)
-    assert clean.main(["results", name, "--yes", "--out", str(tmp_path)]) == 2
+    assert clean.main(["results", name, "--yes", "--results", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: ")
 
 
@@ -415,13 +413,13 @@ def test_names_that_name_no_results(tmp_path, capsys, name):
     "arguments",
     [
         ["results", "study", "--all"],
-        ["results", "study", "--limit", "1GB"],
+        ["results", "study", "--cache-limit", "1GB"],
         ["cache", "study", "--all"],
     ],
 )
 def test_options_of_the_other_kind_are_refused(tmp_path, capsys, arguments):
     kept = results(tmp_path, "0" * 16, records=1)
-    assert clean.main([*arguments, "--yes", "--out", str(tmp_path)]) == 2
+    assert clean.main([*arguments, "--yes", "--results", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: ") and kept.exists()
 
 
@@ -432,26 +430,12 @@ def test_results_that_are_links_are_refused(tmp_path, capsys):
     (out / "mine" / ("0" * 16)).symlink_to(there)
     (out / "study").symlink_to(there.parent)
     for name in ("study", f"study/{'0' * 16}", f"mine/{'0' * 16}"):
-        assert clean.main(["results", name, "--yes", "--out", str(out)]) == 2
+        assert clean.main(["results", name, "--yes", "--results", str(out)]) == 2
         assert "is a link" in capsys.readouterr().err
     assert (there / "experiment.yaml").exists()
 
 
 # ---------------------------------------------------------------- words
-
-
-@pytest.mark.parametrize(
-    ("text", "count"),
-    [("5GB", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0), ("2TB", 2 * 10**12)],
-)
-def test_sizes(text, count):
-    assert bytes_of(text) == count
-
-
-@pytest.mark.parametrize("text", ["", "5", "GB", "-5GB", "5 gigs", "1e3GB", "nan", "5GBx", "５GB"])
-def test_what_is_no_size(text):
-    with pytest.raises(UserError, match="not a size"):
-        bytes_of(text)
 
 
 def test_help_of_clean_loads_nothing_heavy():

@@ -7,7 +7,7 @@ import pytest
 
 from detectors.methods.network import Layer, Network, network_bytes
 from harness.programs.train.gradients import (
-    Descent,
+    AdamDescent,
     Example,
     gradient_of,
     loss_of,
@@ -85,7 +85,7 @@ def test_the_loss_is_least_at_the_true_odds():
 
 def trained(seed: int, steps: int) -> tuple[Network, list[float]]:
     network = new_network(4, -2.0, np.random.default_rng(seed), dilations_px=(1, 1, 1))
-    descent = Descent(network, steps)
+    descent = AdamDescent(network, steps)
     losses = []
     for number in range(steps):
         example = example_of(number % 8)
@@ -112,7 +112,7 @@ def test_equal_seeds_give_equal_weights_and_others_do_not():
 
 def test_the_rate_rises_and_falls_to_0():
     network = new_network(1, 0.0, np.random.default_rng(1), dilations_px=(1,))
-    descent = Descent(network, 100)
+    descent = AdamDescent(network, 100)
     zero = [np.zeros_like(array) for array in parameters_of(network)]
     rates = []
     for _ in range(100):
@@ -126,7 +126,7 @@ def test_the_rate_rises_and_falls_to_0():
 def test_under_a_constant_gradient_each_step_moves_a_weight_by_the_rate():
     """Adam divides the mean gradient by its own size, whatever that is, from the first step on."""
     network = new_network(2, 0.0, np.random.default_rng(1), dilations_px=(1, 1))
-    descent = Descent(network, 10)
+    descent = AdamDescent(network, 10)
     for _ in range(3):
         before = [array.copy() for array in parameters_of(network)]
         rate = descent.rate

@@ -1,0 +1,1 @@
+"""`tofpod start`: from plain questions to an experiment and three commands."""
