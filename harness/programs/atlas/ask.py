@@ -23,17 +23,13 @@ if TYPE_CHECKING:
     from harness.programs.atlas.tables import Row
 
 KINDS = ("through", "blind", "dent", "slot", "gouge")
-"""Kinds of damage that are answered."""
-GOUGE = "gouge"
-"""What people call a scratch."""
+"""Kinds of damage that are answered; a gouge as a slot."""
 SIZE_OF = {"slot": "width"}
 """What a size is of; of all others, the diameter."""
-SHOWN_CAMERAS = 6
-"""Most lines of a chart."""
 ALBEDO = 0.6
 SCRATCH = (
-    "A scratch is answered as a slot of that width and depth; one with a V-shaped section is"
-    " shallower on average, so that its limit is larger."
+    "A scratch (gouge) is answered as a slot of that width and depth; one with a V-shaped section"
+    " is shallower on average, so that its limit is larger."
 )
 
 
@@ -84,8 +80,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
     " with how many frames, from a stored table of limits of simulated set-ups (tofpod atlas),"
     " with intervals. Nothing is extrapolated.",
     "tofpod ask --damage hole --size 5mm --distance 1m",
-    "tofpod ask --damage dent --depth 1mm --distance 1m --camera femto_bolt_nfov --camera pmd_flexx2"
-    " --out compared",
+    "tofpod ask --damage blind --depth 4mm --distance 1m --camera pmd_flexx2",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0 for any answer, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -97,8 +92,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             "--distance is missing",
             legal="--damage hole --size 5mm --distance 1m, or without --size for the size found",
         )
-    damage = damage_kind("--damage", options.damage, KINDS)
-    kind = "slot" if damage == GOUGE else damage
+    called = damage_kind("--damage", options.damage.lower().removesuffix("s"), KINDS)
+    kind = "slot" if called == "gouge" else called
     shards = read_atlas(options.atlas or shipped("baselines") / STORED)
     chosen = _chosen(options.camera, shards)
     used = {shard.camera: shard for shard, _ in chosen}
@@ -118,10 +113,10 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     warnings = _warnings(used.values())
     answer = _headline(kind, asked, rows, size_mm)
-    notes = [_basis(rows), *_assumed(kind, rows, used.values())]
+    notes = [*_next_best(rows, size_mm), _basis(rows), *_assumed(kind, rows, used.values())]
     if not options.camera:
         notes += _same(used.values())
-    if damage == GOUGE:
+    if called == "gouge":
         notes.append(SCRATCH)
     notes += [f"not answered: {reason}" for reason in reasons]
     exact = f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].conditions)}"
@@ -261,10 +256,9 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
         best = min(rows, key=order)
         if math.isnan(best.answer.a90_mm):
             return f"At {conditions.distance_m:g} m, no limit of {DAMAGE[kind]}s{deep} is known."
-        bound = f"{best.answer.low_mm:.2g} to {best.answer.high_mm:.2g} mm"
         return (
             f"At {conditions.distance_m:g} m, {best.surface.title} finds the smallest"
-            f" {DAMAGE[kind]}s{deep} nine times out of ten: {best.answer.a90_mm:.2g} mm ({bound})"
+            f" {DAMAGE[kind]}s{deep} nine times out of ten: {_interval(best)}"
             f" with {many(best.conditions.frames, 'frame')} on albedo {best.conditions.albedo:g}."
         )
     verdicts = [row.verdict for row in rows]
@@ -276,6 +270,31 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
     what = f"{DAMAGE[kind].capitalize()}s of {size_mm:g} mm{deep} at {conditions.distance_m:g} m"
     count = f"{verdicts.count('yes')} of {many(len(rows), 'set-up')}{beside}"
     return f"{what} are found nine times out of ten in {count}."
+
+
+def _interval(row: Row) -> str:
+    """Return ``2.8 mm (2.3 to 3.6 mm)``."""
+    answer = row.answer
+    return f"{answer.a90_mm:.2g} mm ({answer.low_mm:.2g} to {answer.high_mm:.2g} mm)"
+
+
+def _next_best(rows: Sequence[Row], size_mm: float) -> list[str]:
+    """Say which other camera finds the next smallest damage, and whether the order is certain;
+    nothing if a size is asked for, or there is no other with a limit."""
+    from harness.programs.atlas.tables import order
+    from harness.vocabulary.text import many
+
+    best, *others = sorted(rows, key=order)
+    others = [row for row in others if row.surface.title != best.surface.title]
+    if not math.isnan(size_mm) or not others or math.isnan(others[0].answer.a90_mm):
+        return []
+    second = others[0]
+    order_is = "is certain" if second.answer.low_mm > best.answer.high_mm else "is not certain"
+    frames = many(second.conditions.frames, "frame")
+    return [
+        f"Next: {second.surface.title}, {_interval(second)} with {frames}; by their intervals, the"
+        f" order of the two {order_is}."
+    ]
 
 
 def _warnings(shards: Any) -> list[str]:

@@ -41,8 +41,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Compute limits of damage for each camera, at three distances of its range, and write the"
     f" atlas from which tofpod ask answers ({MADE} in the folder of results). A shard of"
     " today's code is kept, also one that comes with tofpod.",
-    "tofpod atlas --dry-run",
-    "tofpod atlas pmd_flexx2 femto_bolt_nfov",
+    "tofpod atlas kinect_v2 --dry-run",
+    "tofpod atlas pmd_flexx2 realsense_l515",
     epilog="Then ask: tofpod ask --distance 1m --atlas results/atlas/atlas.json",
 )
 def main(options: argparse.Namespace, command: str) -> int:
@@ -66,12 +66,13 @@ def main(options: argparse.Namespace, command: str) -> int:
         if current is not None and _is_current(current, planned.digests, names):
             print(f"{planned.camera}: of today's code")
             continue
-        work = planned.work(options.out)
-        totals = [total + count for total, count in zip(totals, work, strict=True)]
         also = f" (also {', '.join(names[1:])})" if len(names) > 1 else ""
-        print(f"{planned.camera}{also}: {_in_words(work)}", flush=True)
         if options.dry_run:
+            work = planned.work(options.out)
+            totals = [total + count for total, count in zip(totals, work, strict=True)]
+            print(f"{planned.camera}{also}: {_in_words(work)}", flush=True)
             continue
+        print(f"{planned.camera}{also}: {len(planned.parts)} distances", flush=True)
         shard = planned.made(options.out, run_options, command)
         if shard is None:
             return 130
@@ -79,8 +80,9 @@ def main(options: argparse.Namespace, command: str) -> int:
         write_atlas(atlas_file, list(stored.values()))
     if options.dry_run:
         print(f"in all: {_in_words(totals)}{_bill(options.out, totals)}")
-    elif totals[0]:
-        print(f"wrote {atlas_file}")
+    else:
+        write_atlas(atlas_file, list(stored.values()))
+        print(f"atlas: {atlas_file}")
     return 0
 
 

@@ -79,11 +79,17 @@ class Planned:
         set_ups: list[SetUp] = []
         checks: list[SetUp] = []
         for part, experiment in zip(self.parts, self.experiments, strict=True):
-            code = run_study(experiment, out, options, command)
+            try:
+                code = run_study(experiment, out, options, command)
+            except UserError as error:
+                print(f"{part.camera} at {part.distance_m:g} m: left out: {error.message}")
+                continue
             if code == 130:
                 return None
             limits = pd.read_parquet(experiment.folder(out) / "limits.parquet")
             (checks if part.is_check else set_ups).extend(set_ups_of(limits, part))
+        if not set_ups:
+            raise UserError(f"{self.camera}: no part of it gave a limit")
         origin = record(command)
         config = self.experiments[0].config
         backing = config.source.to_data()["target"]["backing"]

@@ -15,7 +15,8 @@ EXPERIMENT = "atlas"
 """The experiment of one part."""
 NEAREST_M = 0.3
 FARTHEST_M = 3.0
-ALBEDOS = (0.1, 0.9)
+DARK = 0.1
+BRIGHT = 0.9
 FRAMES = (1, 50)
 DEPTHS_MM: Mapping[str, tuple[float | None, ...]] = {
     "through": (None,),
@@ -37,7 +38,7 @@ EDGE_PX = 7.0
 RADIUS_PX = 10.0
 FALSE_CALLS_PER_BOARD = 0.25
 """False calls on a board: a rate per view, as boards of as many pixels scale with the distance, and
-8 boards can show it."""
+6 boards can show it."""
 CHECKED = ("azure_kinect_nfov", "pmd_flexx2", "realsense_l515")
 """Cameras with a part that is kept aside from the fit: an imager of fine pixels, one of coarse
 pixels, and a scanner."""

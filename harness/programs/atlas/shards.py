@@ -7,11 +7,12 @@ import numpy as np
 from harness.experiment.digests import CAMERA_PART, camera_digests
 from harness.programs.atlas.limits import Conditions, Outside, PlaneNoise
 from harness.programs.atlas.parts import (
-    ALBEDOS,
+    BRIGHT,
     CHECK_ALBEDO,
     CHECK_FRAMES,
     CHECK_SHARE,
     CHECKED,
+    DARK,
     DEPTHS_MM,
     FARTHEST_M,
     FRAMES,
@@ -36,30 +37,33 @@ inspected."""
 
 def parts_of(name: str, noise: PlaneNoise) -> list[Part]:
     """Return the parts of a camera: at the ends of its range and between, where it gives a depth,
-    and of some cameras one that is kept aside."""
+    and of some cameras one that is kept aside.
+
+    As albedo acts by noise alone, only the farthest part has both. The nearest is bright and the
+    middle one dark if the camera gives a depth there, so that the noises span all that is asked."""
     nearest_m = noise.distance_m[0]
     farthest_m = noise.distance_m[-1]
-    distances_m = [nearest_m, between(nearest_m, farthest_m), farthest_m]
-    parts = []
-    for distance_m in distances_m:
-        parts.append(_part(name, noise, distance_m, ALBEDOS, FRAMES))
+    middle_m = between(nearest_m, farthest_m)
+    near = _part(name, nearest_m, _first_visible(noise, nearest_m, (BRIGHT, DARK)), FRAMES)
+    middle = _part(name, middle_m, _first_visible(noise, middle_m, (DARK, BRIGHT)), FRAMES)
+    far = _part(name, farthest_m, _visible(noise, farthest_m, (DARK, BRIGHT)), FRAMES)
+    parts = [near, middle, far]
     if name in CHECKED:
-        distance_m = between(distances_m[0], distances_m[1], CHECK_SHARE)
-        check = _part(name, noise, distance_m, (CHECK_ALBEDO,), (CHECK_FRAMES,), is_check=True)
-        parts.append(check)
+        check_m = between(nearest_m, middle_m, CHECK_SHARE)
+        albedos = _visible(noise, check_m, (CHECK_ALBEDO,))
+        parts.append(_part(name, check_m, albedos, (CHECK_FRAMES,), is_check=True))
     return [part for part in parts if part.albedos]
 
 
-def _part(
-    name: str,
-    noise: PlaneNoise,
-    distance_m: float,
-    albedos: Sequence[float],
-    frames: tuple[int, ...],
-    *,
-    is_check: bool = False,
-) -> Part:
-    """Return the part at a distance, with those albedos at which the camera gives a depth."""
+def _first_visible(
+    noise: PlaneNoise, distance_m: float, albedos: Sequence[float]
+) -> tuple[float, ...]:
+    """Return the first albedo at which the camera gives a depth at a distance, if any."""
+    return _visible(noise, distance_m, albedos)[:1]
+
+
+def _visible(noise: PlaneNoise, distance_m: float, albedos: Sequence[float]) -> tuple[float, ...]:
+    """Return those albedos at which the camera gives a depth at a distance."""
     visible = []
     for albedo in albedos:
         try:
@@ -67,16 +71,27 @@ def _part(
         except Outside:
             continue
         visible.append(albedo)
-    pixel_mm = distance_m / load_camera(name).nominal_lens.fx / MM
+    return tuple(visible)
+
+
+def _part(
+    name: str,
+    distance_m: float,
+    albedos: tuple[float, ...],
+    frames: tuple[int, ...],
+    *,
+    is_check: bool = False,
+) -> Part:
+    """Return the part at a distance."""
     depths_mm = DEPTHS_MM
     if is_check:
         depths_mm = {kind: _kept_aside(depths) for kind, depths in DEPTHS_MM.items()}
     return Part(
         camera=name,
         distance_m=distance_m,
-        albedos=tuple(visible),
+        albedos=albedos,
         frames=frames,
-        pixel_mm=pixel_mm,
+        pixel_mm=distance_m / load_camera(name).nominal_lens.fx / MM,
         depths_mm=depths_mm,
         is_check=is_check,
     )

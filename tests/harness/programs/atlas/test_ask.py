@@ -55,6 +55,7 @@ def test_without_a_size_the_smallest_found_is_the_answer(
     output = said("--damage dents --depth 1mm --distance 0.5m", atlas, capsys)
     assert output.startswith("At 0.5 m, Sharp One, short mode finds the smallest dents, 1 mm deep,")
     assert "with 50 frames" in output.splitlines()[0] and "found?" not in output
+    assert "Next: Dim 2, " in output and "order of the two is" in output
     assert "The same numbers: Twin Two as Sharp One, short mode." in output
 
 
@@ -78,7 +79,7 @@ def test_words_for_damage(atlas: Path, capsys: pytest.CaptureFixture[str]):
     for word in ("crack", "slot", "scratch"):
         output = said(f"--damage {word} --size 3mm --depth 4mm --distance 1m", atlas, capsys)
         assert output.startswith("Crack or slots of 3 mm, 4 mm deep, at 1 m")
-    assert "A scratch is answered as a slot" in output
+    assert "A scratch (gouge) is answered as a slot" in output
 
 
 def test_page_and_table_say_the_same_and_open_at_the_question(

@@ -50,7 +50,12 @@ def test_where_the_camera_gives_no_depth_nothing_is_computed():
     frame_mm[-1, 0] = np.nan  # too dark far away
     frame_mm[0, 3] = np.nan  # too bright near by
     parts = parts_of("kinect_v2", noise(frame_mm))
-    assert [part.albedos for part in parts] == [(0.1,), (0.1, 0.9), (0.9,)]
+    assert [part.albedos for part in parts] == [(0.1,), (0.1,), (0.9,)]
+    assert [part.albedos for part in parts_of("kinect_v2", noise(FINEST))] == [
+        (0.9,),
+        (0.1,),
+        (0.1, 0.9),
+    ]
     with pytest.raises(Outside):
         noise(frame_mm).at(Conditions(0.4, 0.5, 1))
 
