@@ -41,8 +41,6 @@ SAMPLE = 4000
 STEPS = 20
 """Number of steps by closest points (twice as many by distances follow, then as many by planes).
 """
-FEW = 1000
-"""Points that search, before all fit the planes."""
 LEAST_SCALE_M = 0.1 * MM
 FAR_M = 10.0
 EDGE_PX = 1.5  # pixels within this distance of a step or edge of the part are not judged
@@ -188,11 +186,10 @@ def fitted(
     ``share_px``: number of points that share their noise."""
     T = T_start
     pitch_m = spacing(points)
-    few = points[:: max(1, len(points) // FEW)]
     information = np.zeros((6, 6))
     for step in range(3 * STEPS if known else 0, 4 * STEPS):
         by_planes = step >= 3 * STEPS
-        moved = transform_points(T, points if by_planes else few)
+        moved = transform_points(T, points)
         triangle, places = closest_places(triangles.tree, moved)
         offsets = moved - places
         towards = triangles.normals[triangle]

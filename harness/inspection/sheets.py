@@ -3,8 +3,10 @@ data."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
@@ -21,7 +23,7 @@ from harness.inspection.tolerance import (
 from harness.report.blocks import joined, paragraph, template
 from harness.report.findings import Judged
 from harness.report.inspection_page import best_view, definitions, numbered_picture
-from harness.vocabulary.text import Grid
+from harness.vocabulary.text import Grid, many
 
 HEADS = ("place", "decision", "why", "tolerance", "measured", "uncertainty", "guard band")
 MOST_ROWS = 24
@@ -52,11 +54,10 @@ class Sheets:
         name, view = best_view(result)
         limits = " and ".join(tolerance.text for tolerance in self.decision.tolerances)
         about = [*self.about[:2], ("tolerance", limits), *self.about[2:]]
-        digests = [(entry["path"], f"SHA-256 {entry['sha256']}") for entry in self.files]
         missed = self.decision.missed.text
         return template("decision.html").render(
             title=f"Decision on {self.about[0][1]}",
-            answer=f"{self.decision.short}.",
+            answer=f"{self.decision.verdict}.",
             about=definitions(about),
             decisions=decisions_table(self.decision),
             rule=rule_text(),
@@ -64,8 +65,21 @@ class Sheets:
             picture=numbered_picture(result, view, name),
             missed=f"{missed[0].upper()}{missed[1:]}.",
             budget=_budget(self.decision),
-            files=definitions(digests),
+            files=definitions(_by_folder(self.files)),
         )
+
+
+def _by_folder(files: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
+    """Return each folder that was read, with one digest of its files: decision.json has those of
+    all."""
+    digests: dict[str, list[str]] = {}
+    for entry in files:
+        digests.setdefault(str(Path(entry["path"]).parent), []).append(entry["sha256"])
+    rows = []
+    for folder, of_files in digests.items():
+        joint = hashlib.sha256("".join(of_files).encode()).hexdigest()
+        rows.append((folder, f"{many(len(of_files), 'file')}, SHA-256 of their digests {joint}"))
+    return rows
 
 
 def _worst_first(decision: PartDecision) -> list[FindingDecision]:

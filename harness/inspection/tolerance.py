@@ -251,9 +251,17 @@ class PartDecision:
         return CONFORMS if self.missed.is_enough else UNDECIDED
 
     @property
-    def short(self) -> str:
-        """Return ``The part does not conform to a depth of at most 0.5 mm (...)``."""
+    def verdict(self) -> str:
+        """Return ``The part does not conform to a depth of at most 0.5 mm``."""
         limits = " and ".join(tolerance.text for tolerance in self.tolerances)
+        limited = f"a growth in {limits} since {self.since}" if self.since else f"a {limits}"
+        if self.decision == UNDECIDED:
+            return f"Undecided whether the part conforms to {limited}"
+        return f"The part {self.decision} to {limited}"
+
+    @property
+    def short(self) -> str:
+        """Return the verdict with the numbers of the findings that decide it."""
         counts = []
         for decision in DECISIONS:
             numbers = {finding.id for finding in self.findings if finding.decision == decision}
@@ -262,13 +270,8 @@ class PartDecision:
                 listed = joined_words([str(number) for number in sorted(numbers)])
                 prefix = "" if decision == self.decision else f"{decision}: "
                 counts.append(f"{prefix}finding{'s' * (len(numbers) > 1)} {listed}")
-        if self.decision == UNDECIDED:
-            start = "Undecided whether the part conforms"
-        else:
-            start = f"The part {self.decision}"
         found = f" ({'; '.join(counts)})" if counts else ""
-        limited = f"a growth in {limits} since {self.since}" if self.since else f"a {limits}"
-        return f"{start} to {limited}{found}"
+        return f"{self.verdict}{found}"
 
     @property
     def sentence(self) -> str:

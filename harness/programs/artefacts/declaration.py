@@ -35,7 +35,8 @@ class Across(Config):
 
 class QuotedTable(Config):
     """A table in a document. Formats name columns of the data: ``{a90_mm:.1f}``; ``!t`` turns the
-    name of a camera into its title, ``!k`` the settings of a damage into its kind."""
+    name of a camera into its title, ``!k`` the settings of a damage into its kind, ``!w`` any
+    settings into words."""
 
     labels: dict[str, str]
     """Format of the leading cells by head; rows with equal labels are one row."""

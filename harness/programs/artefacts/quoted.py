@@ -25,6 +25,7 @@ from harness.programs.artefacts.ledger import Ledger, age_sentence
 from harness.vocabulary import provenance
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
+from harness.vocabulary.path_names import value_text
 from scenes.sensor.camera import guessed_precision, load_camera
 
 BLOCK = re.compile(r"<!-- artefact: (\w+) -->\n(.*?)<!-- end: \1 -->", re.DOTALL)
@@ -52,11 +53,15 @@ class _Formats(Formatter):
         return super().format_field(value, format_spec)
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        """Return a camera's title for ``!t``, and the kind of a damage for ``!k``."""
+        """Return a camera's title for ``!t``, the kind of a damage for ``!k``, and settings, which
+        may be absent, in words for ``!w``."""
         if conversion == "t":
             return _title(value)
         if conversion == "k":
             return json.loads(value)["kind"]
+        if conversion == "w":
+            settings = json.loads(value) if isinstance(value, str) and value else None
+            return "none" if settings is None else value_text("", settings)
         return super().convert_field(value, conversion)
 
 

@@ -11,7 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from detectors import load_detector
+from detectors.surfaces.drawing import DrawingFile, drawing_under, read_drawing
 from harness import detect
+from harness.inspection.judging import judged
 from harness.inspection.limit import Limit, SizeCount
 from harness.inspection.tolerance import (
     CONFORMS,
@@ -26,10 +29,13 @@ from harness.inspection.tolerance import (
     _doubt,
     combined,
     decided,
+    part_decision,
     tolerances_from,
 )
 from harness.inspection.verdict import DOUBTFUL, SURE
 from harness.vocabulary.errors import UserError
+from tests.detectors.surfaces.test_drawing import casting, stood
+from tests.detectors.surfaces.test_drawing import seen as casting_seen
 from tests.harness.inspection.test_verdict import finding
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
 from tests.validation.tolerance_risks import decided_on
@@ -144,6 +150,33 @@ def test_few_simulated_parts_are_decided_wrongly() -> None:
     clear = [each for each in decisions if not 0.55 < each.true_mm < 1.25]
     assert clear
     assert all(each.decision != UNDECIDED for each in clear)
+
+
+def test_volume_and_deviation_are_those_of_a_dent(tmp_path: Path) -> None:
+    path = casting(tmp_path / "casting.stl")
+    cloud = casting_seen(path, stood((6, -8, 3)), 0.3, dent_mm=3.0)
+    drawing = read_drawing(DrawingFile(file=str(path)))
+    points_m = cloud.points_m[cloud.valid]
+    cloud = replace(cloud, expected=drawing_under(drawing, points_m, central=True))
+    settings = {"crop": {"kind": "none"}, "surface": {"shape": "expected"}}
+    detector = load_detector("local", settings)
+    result = judged(detector, cloud, detector.analyse(cloud), 6.0)
+    tolerances = (Tolerance("volume", 500.0), Tolerance("deviation", 2.0))
+    decision = part_decision(result, tolerances, Missed(""))
+    volume, deviation = decision.findings
+    # a disc of 8 mm radius, 3 mm deep
+    assert abs(volume.value - math.pi * 64 * 3) < 2 * volume.uncertainty
+    assert 0.05 < volume.uncertainty / volume.value < 0.15
+    assert (deviation.place, deviation.decision) == ("part", FAILS)
+    assert deviation.value == pytest.approx(3.0, abs=2 * deviation.uncertainty)
+    # 25 pixels of 0.3 mm each, the largest of some 260 places
+    sizes = {entry.name.split(",")[0]: entry.size for entry in deviation.contributions}
+    assert sizes["noise"] == pytest.approx(0.3 / 5 * 3.55 / GUARD, rel=0.15)
+    without_dent = casting_seen(path, stood((6, -8, 3)), 0.3)
+    undamaged = replace(without_dent, expected=cloud.expected)
+    result = judged(detector, undamaged, detector.analyse(undamaged), 6.0)
+    (deviation,) = part_decision(result, tolerances[1:], Missed("", is_irrelevant=True)).findings
+    assert deviation.decision == CONFORMS
 
 
 def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> None:
