@@ -191,9 +191,12 @@ def main() -> None:
     parser.add_argument(
         "--changed", type=int, default=60, help="checks for each change, and on other boards"
     )
+    parser.add_argument(
+        "--boards", type=int, default=Size.boards, help="boards with damage (default: %(default)s)"
+    )
     options = parser.parse_args()
     began = time.perf_counter()
-    size = Size()
+    size = Size(boards=options.boards)
     print(size)
     changes = {
         **{f"the camera's noise times {noise:.2f}": Change(noise=noise) for noise in NOISES},

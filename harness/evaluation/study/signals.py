@@ -55,7 +55,7 @@ class SignalLine:
 
     @property
     def axes(self) -> tuple[bool, bool]:
-        """Whether the axes are of the logarithms of size and of signal."""
+        """True for an axis of the logarithm, of size and of signal."""
         return self.fit.log_size, self.fit.log_signal
 
     def influence_at(self, pod: float) -> np.ndarray:
@@ -64,7 +64,7 @@ class SignalLine:
 
     @property
     def of_threshold(self) -> float:
-        """By how much one standard error of the threshold moves every size, on its axis."""
+        """Change of every size, on its axis, by one standard error of the threshold."""
         return self.error / self.fit.b1
 
     def log_influence_at(self, pod: float) -> tuple[np.ndarray, float]:
