@@ -19,8 +19,8 @@ call per m2, of which 0.054 m2 are judged; two more for cameras whose outline ta
 MOST_VIEWS = 100
 """Most views to render: one takes 0.2 to 0.5 s of processor time, and a first page is to come
 within a minute of two cores."""
-MOST_JUDGEMENTS = 330
-"""Most judgements of a board by a set-up: one takes some 0.1 s with its share of the frames."""
+MOST_JUDGEMENTS = 180
+"""Most judgements of a board by a set-up: one takes 0.2 to 0.6 s with its share of the frames."""
 LEAST_DRAWS = 2
 CALIBRATION_REPEATS = "threshold.calibrate.repeats"
 CALIBRATED_BOARDS = "threshold.calibrate.boards"

@@ -259,7 +259,8 @@ def _image(
     norm: SymLogNorm,
 ) -> AxesImage:
     """Draw residuals (h, w) with a dot on each pixel of a finding."""
-    axes.set_facecolor("#" + bytes(UNJUDGED_RGB).hex())
+    red, green, blue = UNJUDGED_RGB
+    axes.set_facecolor((red / 255, green / 255, blue / 255))
     axes.grid(visible=False)
     picture = axes.imshow(residual_mm, norm=norm, cmap="RdBu_r", aspect="equal")
     v, u = np.nonzero(detected)

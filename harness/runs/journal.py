@@ -26,7 +26,8 @@ JOURNAL_VERSION = 8
 SEGMENT_NAME = re.compile(r"[0-9]{6}-[0-9a-f]{8}\.jsonl")
 THRESHOLDS = "thresholds-"  # prefix of the keys of entries that hold thresholds
 DESIGNS = "design-"  # prefix of the keys of entries that hold the boards of a study's next batch
-NOT_TRIALS = (THRESHOLDS, DESIGNS)
+PICTURES = "pictures-"  # prefix of the keys of entries that hold a set-up's pictures
+NOT_TRIALS = (THRESHOLDS, DESIGNS, PICTURES)
 NOTHING = "null"  # replaces the record of a trial that is not done
 KEPT = ("state", "why", "is_bug", "seconds", "peak_mb", "worker")
 

@@ -1,8 +1,10 @@
 """Draws a report's pictures again from their seeds: the first damaged repeat or, in a study,
 damages near the limit."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from harness.records.examples import (
     StudyExample,
     Where,
 )
+from harness.runs.journal import PICTURES
 from harness.runs.plan import Batch, Group, SweepPlan
 from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, LabelledCloud, load_board
@@ -27,6 +30,8 @@ from harness.trials.clouds import MapClouds, TrialPoint, mapping_of
 from harness.trials.judge import Criteria, Judgement, detector_for, judge
 from harness.trials.trial import Trial, capture_of, clouds_of, view_clouds
 from harness.vocabulary.geometry import MM, transform_points
+from harness.vocabulary.provenance import source_digest
+from harness.vocabulary.seeds import digest
 from scenes.target.truth import Damage, face_of
 
 MOST_POINTS = 60_000  # most points of a merged cloud in a picture
@@ -35,6 +40,8 @@ SHARES: dict[Where, float] = {"below": 0.75, "at": 1.0, "above": 1.25}
 MOST_SET_UPS = 6
 ROOM_MM = 12.0  # margin around the largest damage of a set-up, whose pictures all have one size
 GREY = 160
+ARRAYS = ("residual_mm", "detected", "outline_px")
+"""Fields of a study's example that are arrays."""
 
 
 def pictures_of(
@@ -344,36 +351,71 @@ def study_examples(
     return [_study_example(damage, thresholds) for damage in shown]
 
 
-def _study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
-    """Return the picture of a damage. The trial is repeated exactly."""
+def examples_as_text(examples: Iterable[StudyExample]) -> str:
+    """Return pictures as JSON for the journal; NaN and infinity stand in it as such."""
+    data = [asdict(example) for example in examples]
+    return json.dumps(data, default=np.ndarray.tolist)
+
+
+def examples_of_text(text: str) -> list[StudyExample]:
+    """Return the pictures that `examples_as_text` wrote."""
+    examples = []
+    for stored in json.loads(text):
+        arrays = {name: np.array(stored[name]) for name in ARRAYS}
+        examples.append(StudyExample(**(stored | arrays)))
+    return examples
+
+
+def pictures_key(shown: Sequence[ShownDamage], thresholds: Mapping[str, float]) -> str:
+    """Return the key in the journal of a set-up's pictures: a digest of all that decides them."""
+    content: list[Any] = [source_digest((__name__,), ())]
+    for damage in shown:
+        key, _ = _trial_of(damage, thresholds)
+        content.append([key, damage.point.digest, damage.where, damage.half_m, _facts_of(damage)])
+    return f"{PICTURES}{digest(json.dumps(content))}"
+
+
+def _trial_of(shown: ShownDamage, thresholds: Mapping[str, float]) -> tuple[str, Trial]:
+    """Return the trial that inspected a damage, with its key in the journal."""
+    repeat = int(shown.limit.record.inspected.repeat[shown.row])
+    (keyed_trial,) = shown.group.trials(shown.batch, thresholds, [repeat])
+    return keyed_trial
+
+
+def _facts_of(shown: ShownDamage) -> dict[str, Any]:
+    """Return what a study's record says of a damage."""
     inspected = shown.limit.record.inspected
     row = shown.row
-    repeat = int(inspected.repeat[row])
-    trial = next(
-        trial for _, trial in shown.group.trials(shown.batch, thresholds) if trial.repeat == repeat
-    )
+    pod = float("nan")
+    if shown.limit.statement is not None:
+        pod = float(shown.limit.statement.curve.pod(inspected.size_mm[row]))
+    return {
+        "variant": shown.point.variant,
+        "board": int(inspected.board[row]),
+        "hole": str(inspected.hole[row]),
+        "hit": bool(inspected.hit[row]),
+        "score": float(inspected.signal[row]),
+        "pod": pod,
+    }
+
+
+def _study_example(shown: ShownDamage, thresholds: Mapping[str, float]) -> StudyExample:
+    """Return the picture of a damage. The trial is repeated exactly."""
+    facts = _facts_of(shown)
+    _, trial = _trial_of(shown, thresholds)
     point = next(point for point in trial.points if point.digest == shown.point.digest)
     board = load_board(trial.views[0])
     evidence, detected = _found(_seen_again(trial, point, point.frames), point.criteria)
-    hole = str(inspected.hole[row])
-    damage = next(damage for damage in board.truth if str(damage.id) == hole)
+    damage = next(damage for damage in board.truth if str(damage.id) == facts["hole"])
     rim_px = _outline_px(board, damage)
     pitch_mm = float(np.mean(board.pitch_mm))
     half_m = max(shown.half_m, damage.reach_m + ROOM_MM * MM)
     half = int(np.ceil(half_m / MM / pitch_mm))
     middle = np.round(rim_px.mean(axis=0)).astype(int)
-    pod = float("nan")
-    if shown.limit.statement is not None:
-        pod = float(shown.limit.statement.curve.pod(inspected.size_mm[row]))
     return StudyExample(
-        variant=shown.point.variant,
+        **facts,
         frames=point.frames,
-        board=int(inspected.board[row]),
-        hole=hole,
         where=shown.where,
-        pod=pod,
-        hit=bool(inspected.hit[row]),
-        score=float(inspected.signal[row]),
         diameter_mm=damage.diameter_m / MM,
         depth_mm=damage.depth_m / MM,
         threshold=float("nan") if point.criteria.threshold is None else point.criteria.threshold,

@@ -4,15 +4,18 @@ import datetime
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from harness.evaluation.study.limit import SetUpLimit
 from harness.evaluation.study.record import record_text
 from harness.evaluation.study.result import evaluate_study
 from harness.experiment.digests import experiment_digests
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment
+from harness.records.examples import StudyExample
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
 from harness.report.claims import claim_set_of
@@ -24,10 +27,16 @@ from harness.runs.bill import BILL, Bill, Metered
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import pictures_from, render_missing, values_of
-from harness.runs.jobs import STATES, Job, Outcome
+from harness.runs.jobs import STATES, Ended, Job, Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
-from harness.runs.pictures import shown_in, study_examples
+from harness.runs.pictures import (
+    examples_as_text,
+    examples_of_text,
+    pictures_key,
+    shown_in,
+    study_examples,
+)
 from harness.runs.plan import SweepPlan
 from harness.runs.precision import Batches, refuse_shard
 from harness.runs.results_folder import point_to
@@ -109,7 +118,16 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             if experiment.config.study is None:
                 shown = _write_report(folder, experiment, outcome, tables, provenance)
             else:
-                shown = _write_study(folder, experiment, plan, outcome, tables, provenance, engine)
+                shown = _write_study(
+                    folder,
+                    experiment=experiment,
+                    plan=plan,
+                    outcome=outcome,
+                    tables=tables,
+                    provenance=provenance,
+                    journal=journal,
+                    engine=engine,
+                )
             bill.divide_trials(_frames_share(tables))
             provenance[BILL] = bill.rounded()
             write_json(folder / PROVENANCE.name, provenance)
@@ -158,6 +176,7 @@ def _write_study(
     outcome: Outcome,
     tables: ResultTables,
     provenance: dict[str, Any],
+    journal: Journal,
     engine: Metered,
 ) -> list[str | Grid]:
     """Write a study's record, tables and report. Return what the terminal shows."""
@@ -173,23 +192,54 @@ def _write_study(
         study, tables, experiment.data, each_of=partial(values_of, engine=engine)
     )
     engine.bill.begin("tables and page")
-    shown = list(shown_in(plan, result.limits))
-    # trials that ran on other machines may have no views here
-    views = [job for damages in shown for damage in damages for job in damage.batch.renders]
-    lost = render_missing(views, engine)
-    outcome.failures += lost
-    jobs = []
-    if not lost:
-        for number, damages in enumerate(shown):
-            arguments = (damages, outcome.thresholds)
-            jobs.append(Job(f"pictures of set-up {number}", "trials", study_examples, arguments))
-    # other processes draw the damages again while this process draws the figures
-    examples = pictures_from(jobs, engine, outcome)
+    examples = _examples(plan, result.limits, outcome, journal, engine)
     frames = {table: table.frame(rows) for table, rows in study_tables(result).items()}
     write_tables(folder, frames, provenance)
     page = study_html(result, examples, provenance, resolved_yaml(experiment), title_of(experiment))
     write_text(folder / REPORT.name, page)
     return study_parts(result)
+
+
+def _examples(
+    plan: SweepPlan,
+    limits: Sequence[SetUpLimit],
+    outcome: Outcome,
+    journal: Journal,
+    engine: Metered,
+) -> Iterator[StudyExample]:
+    """Return an iterator over the damages to show. Those that the journal lacks are drawn again by
+    other processes, while this process draws the figures, and stored: drawing them would be a
+    quarter of what a run costs that has nothing else to do."""
+    shown = {}
+    for damages in shown_in(plan, limits):
+        shown[pictures_key(damages, outcome.thresholds)] = damages
+    unknown = [damages for key, damages in shown.items() if journal.state(key) != "done"]
+    # trials that ran on other machines may have no views here
+    views = [job for damages in unknown for damage in damages for job in damage.batch.renders]
+    lost = render_missing(views, engine)
+    outcome.failures += lost
+    jobs = []
+    if not lost:
+        for number, damages in enumerate(unknown):
+            arguments = (damages, outcome.thresholds)
+            jobs.append(Job(f"pictures of set-up {number}", "trials", study_examples, arguments))
+    drawn = pictures_from(jobs, engine, outcome)
+
+    def examples() -> Iterator[StudyExample]:
+        by_set_up: dict[tuple[str, int], list[StudyExample]] = {}
+        for example in drawn:
+            by_set_up.setdefault((example.variant, example.frames), []).append(example)
+        for key, damages in shown.items():
+            record = damages[0].limit.record
+            own = by_set_up.get((record.variant, record.frames), [])
+            entry = journal.read(key)
+            if own:
+                journal.write(key, Ended("done", examples_as_text(own)))
+            elif entry is not None:
+                own = examples_of_text(entry.value)
+            yield from own
+
+    return examples()
 
 
 def title_of(experiment: Experiment) -> str:

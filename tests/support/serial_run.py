@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.runs.jobs import Outcome
-from harness.runs.journal import THRESHOLDS, Journal
+from harness.runs.journal import NOT_TRIALS, Journal
 from harness.runs.plan import SweepPlan
 from harness.runs.processes import SerialEngine
 from harness.runs.run import run_plan
@@ -31,4 +31,4 @@ def trial_count(plan: SweepPlan) -> int:
 
 def trial_keys(journal: Journal) -> list[str]:
     """Keys of all trials, sorted."""
-    return sorted(key for key, _ in journal.entries() if not key.startswith(THRESHOLDS))
+    return sorted(key for key, _ in journal.entries() if not key.startswith(NOT_TRIALS))

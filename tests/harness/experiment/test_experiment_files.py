@@ -105,9 +105,15 @@ def test_a_quick_run_has_the_ends_of_long_axes() -> None:
     assert asked.sweep["source.target.distance_m"] == (0.5, 1.0, 1.5)
 
 
+def test_a_quick_run_of_the_detection_limit_has_all_its_set_ups() -> None:
+    first_look = load_experiment(FOLDER / "detection_limit.yaml", quick=True)
+    stated = [point for point in points_of("detection_limit") if not point.unknowns]
+    assert {point.variant for point in first_look.points} == {point.variant for point in stated}
+
+
 def test_a_quick_run_has_few_draws() -> None:
     draws = load_experiment(FOLDER / "thesis_inference.yaml", quick=True).config.draws
-    assert draws == quick.MOST_VIEWS // 2  # each has a view with and one without damage
+    assert draws == quick.MOST_JUDGEMENTS // 5  # four repeats, and one that sets the threshold
 
 
 def test_every_variation_of_averaging_changes_something() -> None:

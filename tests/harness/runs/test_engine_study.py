@@ -22,8 +22,11 @@ from harness.experiment.digests import experiment_digests
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import Point
 from harness.records.trials import ResultTables
-from harness.runs import run
+from harness.runs import run, study
 from harness.runs.calibration import QuietRun, threshold_of
+from harness.runs.journal import PICTURES, Journal
+from harness.runs.options import EngineOptions
+from harness.runs.pictures import examples_as_text, examples_of_text
 from harness.runs.plan import plan_of
 from harness.runs.study_record import (
     RECORDED_PROVENANCE,
@@ -302,10 +305,45 @@ def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, m
     shutil.copytree(results(finished) / "journal", journal)
     (segment,) = journal.iterdir()
     first, *lines = segment.read_text().splitlines(keepends=True)
-    assert len(lines) == 12 + 1, "beside the trials there are the thresholds"
+    assert len(lines) == 12 + 1 + 2, "beside the trials: thresholds, and pictures of two set-ups"
     segment.write_text(first + "".join(line for number, line in enumerate(lines) if number % 3))
     resumed, _ = judged(finished.parent, journal, monkeypatch)
     assert set_ups_of(resumed) == parallel
+
+
+def test_pictures_of_damage_are_drawn_once(finished, tmp_path, monkeypatch):
+    """A run that finds all trials takes its pictures from the journal, unknown numbers included,
+    and draws those again that other thresholds show."""
+    out = tmp_path / "out"
+    shutil.copytree(finished, out, symlinks=True)
+    before = examples_on(results(out))
+
+    def is_drawn(shown: object, thresholds: object) -> None:
+        raise AssertionError("drawn again")
+
+    monkeypatch.setattr(study, "study_examples", is_drawn)
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    serial = EngineOptions(serial=True)
+    assert study.run_study(experiment, out, serial, "again") == 0
+    assert examples_on(results(out)) == before
+    assert before.count("<figure") == 2
+
+    journal = Journal(results(out) / "journal")
+    (key, *_) = [key for key, _ in journal.entries() if key.startswith(PICTURES)]
+    entry = journal.read(key)
+    assert entry is not None
+    (first, *_) = examples_of_text(entry.value)
+    unknown = replace(first, depth_mm=np.inf, score=np.nan)
+    (again,) = examples_of_text(examples_as_text([unknown]))
+    for name, value in vars(unknown).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+    assert again.detected.dtype == bool
+
+
+def examples_on(folder: Path) -> str:
+    """Return the part of a study's page that shows damage."""
+    page = (folder / "report.html").read_text()
+    return page[page.index("<h2>Examples") : page.index("Limits of validity")]
 
 
 # ---- two detectors that test the harness
