@@ -12,7 +12,7 @@ from harness.stills.solid_gauge import SolidGauge
 if TYPE_CHECKING:
     import trimesh
 
-# facets of a full circle: a sphere of 30 mm is then less than 9 um too flat
+# facets of a full circle: a sphere of 30 mm is then within 9 um of round
 FACETS = 96
 OVERLAP_MM = 0.5  # depth by which joined bodies overlap, so that no faces coincide
 # modules are this much too wide, so that those that touch at a corner are one body
@@ -31,7 +31,11 @@ def solid_of(gauge: SolidGauge) -> trimesh.Trimesh:
     for ball in gauge.spheres:
         post_mm = ball.z_mm + OVERLAP_MM
         bodies.append(_cylinder(gauge.post_mm, post_mm, (ball.x_mm, ball.y_mm, -OVERLAP_MM)))
-        sphere = manifold3d.Manifold.sphere(ball.diameter_mm / 2, FACETS)
+        radius_mm = ball.diameter_mm / 2
+        sphere = manifold3d.Manifold.sphere(radius_mm, FACETS)
+        # facets within the sphere would make it 7 um too small on the average
+        larger = float(np.cbrt(4 / 3 * np.pi * radius_mm**3 / sphere.volume()))
+        sphere = sphere.scale((larger, larger, larger))
         bodies.append(sphere.translate((ball.x_mm, ball.y_mm, ball.z_mm)))
     whole = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
     cutters = [*_marks_of(gauge, above_mm=OVERLAP_MM)]

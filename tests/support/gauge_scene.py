@@ -70,7 +70,7 @@ FRAMES = 12
 
 
 def exact_gauge() -> SolidGauge:
-    """The printed gauge, as exact as its facets: they flatten spheres by up to 9 um."""
+    """The printed gauge, as exact as its facets, which are within 9 um of round."""
     exact = SolidUncertainty(place_mm=0.01, scale=0.0)
     return designed(is_cut=False).model_copy(update={"uncertainty": exact})
 
