@@ -7,7 +7,7 @@ surfaces' albedo is stated and not measured."""
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -105,17 +105,26 @@ class Stated(NamedTuple):
 
 
 def write_camera(
-    path: Path, title: str, like: str | None, measured: Characteristics, albedo: float, rate: Stated
+    path: Path,
+    title: str,
+    like: str | None,
+    measured: Characteristics,
+    albedo: float,
+    rate: Stated,
+    by_gauge: Sequence[Stated] = (),
 ) -> AnyCamera:
     """Write the camera file, refitted from a known camera ``like`` or empirical, and return the
-    camera. Raises UserError if the known camera has another image size, or if the file cannot be
-    written."""
+    camera. What a gauge shows takes the place of what the captures do. Raises UserError if the
+    known camera has another image size, or if the file cannot be written."""
     names = ", ".join(capture.name for capture in measured.captures)
     source = f"measured by tofpod characterise on {names}, {date.today().isoformat()}"
     declared = (
         _refitted(like, measured, albedo, source) if like else _empirical(measured, albedo, source)
     )
     facts = [*_of_unit(measured, source), *declared]
+    better = {(fact.section, fact.key): fact for fact in by_gauge}
+    facts = [fact for fact in facts if (fact.section, fact.key) not in better]
+    facts += better.values()
     if like and is_camera_path(like):
         like = os.path.relpath(like, path.parent)  # a path is relative to the file that names it
     lines = [

@@ -42,6 +42,13 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "and spacings; a single frame will do"
     )
     add("--spheres", metavar="DIAMETER", help=sphere_help)
+    gauge_help = (
+        "truth of a solid gauge (tofpod gauge --print) that the first PATH shows: scale and bias "
+        "of range, errors of spheres, blur"
+    )
+    add("--gauge", type=Path, metavar="FILE.json", help=gauge_help)
+    calliper_help = "the gauge's calliper.csv with measured sizes"
+    add("--calliper", type=Path, metavar="FILE.csv", help=calliper_help)
     add("--albedo", type=float, default=0.6, help="assumed albedo of the surfaces (default: 0.6)")
     add(
         "--rate",
@@ -76,11 +83,12 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Measure a depth camera on static captures, preferably of a matte wall that fills the view: "
     "noise against range, angle and amplitude, correlation, dropouts, displaced frames, fixed "
     "pattern, fill rate, edges. Write a page, tables, and my_camera.yaml, a camera for "
-    "experiments (source.camera.name: ./my_camera.yaml). Each PATH is a capture of 50 frames or "
-    "more, in any format that tofpod detect reads, in order of time. Captures at several "
-    "distances, with the camera moved sideways by 30 mm or more, show the most.",
+    "experiments (source.camera.name: ./my_camera.yaml). With --gauge, one recording of a printed "
+    "gauge also shows scale and bias of range, errors of spheres, and blur. Each PATH is a capture "
+    "of 50 frames or more, in any format that tofpod detect reads, in order of time. Captures at "
+    "several distances, with the camera moved sideways by 30 mm or more, show the most.",
     "tofpod characterise captures/near captures/far --like azure_kinect_nfov --out my_camera",
-    "tofpod characterise captures/near captures/far --certificate --about serial=7 --out my_camera",
+    "tofpod characterise captures/gauge --gauge gauge/gauge.json --out my_camera",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
@@ -97,6 +105,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         write_camera,
     )
     from harness.programs.camera.certificate import write_certificate
+    from harness.programs.camera.gauge_report import read_recording, write_reading
     from harness.programs.camera.measure import characteristics, read_still
     from harness.programs.camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
     from harness.programs.camera.spheres import run_spheres
@@ -119,6 +128,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     refuse_repeats(options.paths)
     if options.spheres:
         return run_spheres(options, command)
+    if options.calliper and not options.gauge:
+        raise UserError("--calliper corrects a gauge", fix="name its truth with --gauge")
+    by_gauge = None
+    if options.gauge:
+        by_gauge = read_recording(options)
+        write_reading(options, by_gauge, command)
     recordings = [
         opened_as(options.like, [path], options.intrinsics, **reading_of(options))
         for path in options.paths
@@ -136,8 +151,15 @@ def main(options: argparse.Namespace, command: str) -> int:
         rate = rate._replace(value=frames_per_second, source=f"of {options.like}")
     names = ", ".join(capture.name for capture in captures)
     print("fitting the camera file ..", file=sys.stderr)
+    facts_of_gauge = by_gauge.stated() if by_gauge and not options.like else []
     camera = write_camera(
-        options.out / CAMERA_FILE, options.title, options.like, measured, options.albedo, rate
+        options.out / CAMERA_FILE,
+        options.title,
+        options.like,
+        measured,
+        options.albedo,
+        rate,
+        facts_of_gauge,
     )
     print("simulating the captures from it ..", file=sys.stderr)
     twin = characteristics(simulated(camera, measured, options.albedo), poses)

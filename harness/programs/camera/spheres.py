@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 RULE = (
     f"A sphere is fitted along the rays, to pixels within {STEEPEST_DEG:g} degrees of incidence "
-    "and 1.5 pixels inside its silhouette. Size (PS) is the diameter of the best sphere minus the "
+    "and 2.5 pixels inside its silhouette. Size (PS) is the diameter of the best sphere minus the "
     "stated one, form (PF) the width of the shell that holds 99.7 % (VDI/VDE 2634-2) or 95 % (ISO "
     "10360-13) of the points; spacings are those of centres with the stated diameter. Intervals of "
     "95 % hold the noise that the average keeps, not errors that a whole sphere shares."
@@ -305,5 +305,5 @@ def _residuals_mm(image: RangeImage, fit: SphereFit) -> np.ndarray:
     """Return the residuals of a sphere as the picture of its pixels, NaN beside them."""
     picture = np.full(image.range_m.shape, np.nan)
     picture.ravel()[fit.pixels] = fit.residual_m / MM
-    rows, columns = np.divmod(fit.pixels, picture.shape[1])
+    rows, columns = np.divmod(fit.pixels, image.range_m.shape[1])
     return picture[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]

@@ -14,7 +14,8 @@ import pytest
 import trimesh
 
 from harness.programs.inspections import gauge
-from harness.programs.inspections.gauge_solid import designed, inlay_of, model_3mf, solid_of
+from harness.programs.inspections.gauge_solid import designed, model_3mf
+from harness.stills.solid_body import inlay_of, solid_of
 from harness.stills.solid_gauge import SolidGauge, calliper_form, corrected, read_solid_gauge
 from harness.vocabulary.errors import UserError
 
