@@ -81,7 +81,7 @@ class Program:
     """Does its work; takes the parsed arguments and the whole command, and returns the exit code.
     """
     description: str
-    examples: tuple[str, ...]
+    examples: tuple[str, ...] = ()
     """Two whole commands, which its help shows and a test runs."""
     epilog: str | None = None
     further: Mapping[str, Program] = field(default_factory=dict)
@@ -112,7 +112,10 @@ class Program:
         if words and words[0] in self.further:
             return self.further[words[0]], words[1:]
         if words and nearest(words[0], self.further) is not None:
-            self.parser().refuse(words[0], self.further)
+            parser = self.parser()
+            # where the program itself takes words, this may be one of them
+            if all(action.option_strings for action in parser._actions):
+                parser.refuse(words[0], self.further)
         return self, words
 
     def __call__(self, arguments: list[str] | None = None) -> int:

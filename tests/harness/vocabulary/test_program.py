@@ -86,6 +86,20 @@ def test_a_mistyped_further_program_is_not_taken_for_arguments(capsys) -> None:
     assert "raed: there is no such argument; did you mean read?" in capsys.readouterr().err
 
 
+def test_an_argument_may_resemble_a_further_program() -> None:
+    further = Program("score rank", lambda parser: None, lambda parsed, command: 1, "Ranks.", ())
+    score = Program(
+        "score",
+        lambda parser: parser.add_argument("maps"),
+        lambda parsed, command: int(parsed.maps != "ranks"),
+        "Scores.",
+        (),
+        further={"rank": further},
+    )
+    assert score(["ranks"]) == 0
+    assert score(["rank"]) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "count"),
     [("5GB", 5_000_000_000), ("5", 5_000_000_000), ("1.5 mb", 1_500_000), ("0kB", 0)],
