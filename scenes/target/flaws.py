@@ -211,6 +211,8 @@ class CorrosionConfig(_FlawConfig):
         stretch_m = radius_m * outline(np.arctan2(t, s)) / mean_radius
         grain_cells = self.grain_mm / self.diameter_mm * ROUND
         noise = gaussian_filter(rng.standard_normal(s.shape), grain_cells / np.sqrt(2))
+        # a patch narrower than its grain lies on one slope of it: only the mean depth is stated
+        noise -= noise.mean()
         noise *= self.rough_mm * MM / max(float(noise.std()), 1e-12)
         ramp = np.clip((1 - ring) / 0.1, 0.0, 1.0)
         depth_m = np.maximum(self.depth_mm * MM + noise, 0.0) * ramp

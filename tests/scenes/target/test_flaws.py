@@ -21,7 +21,7 @@ from harness.vocabulary.geometry import Cloud, Region
 from scenes.target.checks import check_target
 from scenes.target.custom import TargetConfig
 from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.flaws import CorrosionConfig
+from scenes.target.flaws import CorrosionConfig, _mean
 from scenes.target.mesh import Target, board_solid, build_target
 from scenes.target.part import crossing, part_of
 from scenes.target.truth import face_of, outline_board_m, truth_of
@@ -135,6 +135,22 @@ def test_a_sheet_pressed_deeper_than_it_is_thick_stays_whole() -> None:
         assert mesh.vertices[:, 2].min() == pytest.approx(deep, abs=1e-9)
         assert mesh.vertices[:, 2].max() == pytest.approx(5e-3 if sign > 0 else 0.0, abs=1e-9)
         assert built.truth[0].raised is (sign > 0)
+
+
+@pytest.mark.parametrize("seed", range(13))
+def test_corrosion_narrower_than_its_grain_has_the_stated_depth(seed: int) -> None:
+    relief = CorrosionConfig(
+        id=1,
+        kind="corrosion",
+        centre_mm=(0.0, 0.0),
+        diameter_mm=2.0,
+        depth_mm=0.5,
+        grain_mm=3.0,
+        seed=seed,
+    ).relief()
+    assert np.isfinite(relief.depth_m).all()
+    depth_m = _mean(relief.s_m, relief.t_m, relief.depth_m)
+    assert depth_m == pytest.approx(0.5e-3)
 
 
 def test_corrosion_has_the_stated_statistics() -> None:
