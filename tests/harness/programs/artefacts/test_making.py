@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from harness.experiment.load import load_experiment
 from harness.programs.artefacts import declaration, ledger, making
 from harness.programs.artefacts.artefacts import main
 from harness.programs.artefacts.ledger import read_ledger
@@ -196,6 +197,15 @@ def test_a_quick_run_says_so_and_a_whole_one_replaces_it(
     assert times_made(checkout) == 2
     assert page(checkout)["numbers"] == TABLE
     assert page(checkout)["copy"] == ""
+
+
+def test_a_quick_run_of_a_sweep_keeps_all_its_set_ups() -> None:
+    """Documents quote them by name; a first look by hand leaves some out."""
+    file = provenance.ROOT / "experiments" / "today.yaml"
+    _, sweep = making._with_all_set_ups("experiments/today.yaml")
+    whole = load_experiment(file, [sweep], quick=True).config
+    assert whole.sweep == load_experiment(file).config.sweep
+    assert whole.sweep != load_experiment(file, quick=True).config.sweep
 
 
 def test_what_fails_is_named_and_the_rest_is_made(
