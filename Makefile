@@ -61,10 +61,10 @@ docs: .venv/.ready
 	sed "s#](docs/#](#g" CONTRIBUTING.md > docs/contributing.md
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# Five minutes; needed after a change of pyproject.toml's dependencies only.
+# One lock for every platform and Python; needed after a change of pyproject.toml's dependencies only.
 lock: .venv/.ready
-	$(BIN)/pip-compile --quiet --extra dev --extra cluster --extra peers --generate-hashes --strip-extras --allow-unsafe \
-	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links -o requirements.lock pyproject.toml
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --extra all --extra dev --generate-hashes \
+	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o requirements.lock pyproject.toml
 
 # pip would compile every file of every package, which takes as long as the rest; Python compiles what it imports.
 .venv/.installed: requirements.lock pyproject.toml

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-import detectors
 from detectors import load_detector
 from detectors.interface import Calibratable, Detector
 from detectors.methods.peers import FpfhMemoryConfig, FpfhMemoryDetector, coreset, nearest
 from harness.programs.keeping.ls import main as ls
 from harness.testing import check_detector
 from harness.testing.synthetic_clouds import plane, with_gaps
+from harness.vocabulary import extras
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Region
 
@@ -220,7 +220,7 @@ def test_the_library_neither_prints_nor_writes_nor_sets_threads(
 
 
 def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(detectors, "find_spec", lambda package: None)
+    monkeypatch.setattr(extras, "find_spec", lambda package: None)
     with pytest.raises(UserError, match="needs the package py4dgeo") as caught:
         load_detector("m3c2", {})
     assert caught.value.fix == "pip install 'tofpod[peers]'"
