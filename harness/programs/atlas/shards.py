@@ -41,8 +41,11 @@ def parts_of(name: str, noise: PlaneNoise) -> list[Part]:
 
     As albedo acts by noise alone, only the farthest part has both. The nearest is bright and the
     middle one dark if the camera gives a depth there, so that the noises span all that is asked."""
-    nearest_m = noise.distance_m[0]
-    farthest_m = noise.distance_m[-1]
+    distances_m = np.array(noise.distance_m)[np.isfinite(noise.frame_mm).any(axis=1)]
+    if not len(distances_m):
+        return []
+    nearest_m = float(distances_m[0])
+    farthest_m = float(distances_m[-1])
     middle_m = between(nearest_m, farthest_m)
     near = _part(name, nearest_m, _first_visible(noise, nearest_m, (BRIGHT, DARK)), FRAMES)
     middle = _part(name, middle_m, _first_visible(noise, middle_m, (DARK, BRIGHT)), FRAMES)

@@ -56,6 +56,9 @@ def test_where_the_camera_gives_no_depth_nothing_is_computed():
         (0.1,),
         (0.1, 0.9),
     ]
+    frame_mm[0] = np.nan  # nothing near by: the next distance is the nearest
+    assert [part.distance_m for part in parts_of("kinect_v2", noise(frame_mm))] == [0.95, 1.7, 3.0]
+    assert parts_of("kinect_v2", noise(FINEST * np.nan)) == []
     with pytest.raises(Outside):
         noise(frame_mm).at(Conditions(0.4, 0.5, 1))
 
