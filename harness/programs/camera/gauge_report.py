@@ -238,9 +238,9 @@ def _of_edges(blur: Blur | None) -> Iterator[GaugeFigure]:
     value = Estimate(blur.blur_px, ends.low, ends.high)
     meaning = "standard deviation of the Gaussian that gives edges as captured"
     yield GaugeFigure("blur at edges", "steps, grooves, pockets", "px", value, meaning)
-    wide = (WIDTH_10_90 * end for end in (blur.blur_px, ends.low, ends.high))
+    wide = Estimate(WIDTH_10_90 * blur.blur_px, WIDTH_10_90 * ends.low, WIDTH_10_90 * ends.high)
     meaning = "edge response from 10 to 90 % of a step"
-    yield GaugeFigure("edge width", "steps, grooves, pockets", "px", Estimate(*wide), meaning)
+    yield GaugeFigure("edge width", "steps, grooves, pockets", "px", wide, meaning)
     meaning = "share of pixels with a range at edges, over that beside them"
     fill = Estimate(blur.fill)
     yield GaugeFigure("fill at edges", "steps, grooves, pockets", "1", fill, meaning)
