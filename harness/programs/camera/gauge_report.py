@@ -56,6 +56,8 @@ WIDTH_10_90 = 2.563
 """Width of a Gaussian edge between 10 and 90 % of its step, in standard deviations."""
 SEEN = 5.0
 """Signal over noise at which a pocket counts as seen."""
+WORST_SHOWN_MM = 10.0
+"""Residual beyond which the colours end: the outline, where what lies behind is mixed in."""
 
 
 @dataclass(frozen=True)
@@ -371,7 +373,9 @@ def _residual_picture(reading: GaugeReading) -> str:
 
     def draw(canvas: Figure) -> None:
         axes = canvas.subplots()
-        drawn = axes.imshow(cut, cmap="RdBu_r", norm=residual_norm(cut))
+        drawn = axes.imshow(
+            cut, cmap="RdBu_r", norm=residual_norm(cut[np.abs(cut) < WORST_SHOWN_MM])
+        )
         axes.set(xticks=[], yticks=[])
         residual_bar(canvas, drawn, "range minus gauge, mm", ax=axes)
 
