@@ -54,7 +54,8 @@ COMMANDS = re.compile(
 ONLY_PARSED = {
     "coverage pipe": "takes minutes; test_coverage runs the program on a smaller part",
     "--set-up": "needs a study with a curve; test_gauge and test_mapod run the chain",
-    "--gauge": "needs the gauge of such a study; test_gauge runs it",
+    "--gauge": "needs a capture of a gauge; test_gauge and test_gauge_reading run it",
+    "--spheres": "needs a capture of spheres; test_spheres_program runs it",
     "--scheduler": "needs a cluster; test_engine_cluster runs sweeps on one",
     "check experiments/regression.yaml": "takes minutes; .ci/run runs it as it stands",
     "--camera ./blaze101.yaml": "needs captures by that camera; test_validate and test_validate_capture run these",

@@ -53,6 +53,12 @@ LEAST_EVIDENCE = 20.0
 """Least logarithm of the likelihood of a sphere over that of a plane, which has as many free
 numbers; among the 3e5 places of an image, noise alone reaches 13."""
 MOST_SPHERES = 12
+LOOSEST = 0.1
+"""Largest relative error of a free radius: pieces of edges and noise do not determine one."""
+OTHER_SIZE = 0.1
+"""Relative difference of radii from which a sphere is another one, beside three of its errors."""
+SCREENED_PX = 500
+"""Pixels with which a candidate is judged before all are fitted."""
 
 
 def farthest_m(pitch_rad: float, radius_m: float) -> float:
@@ -193,14 +199,19 @@ def disc(
     return pixels if near is None else near[pixels]
 
 
-def fit_sphere(image: RangeImage, start_m: np.ndarray, radius_m: float) -> SphereFit | NoFit:
+def fit_sphere(
+    image: RangeImage, start_m: np.ndarray, radius_m: float, most_px: int | None = None
+) -> SphereFit | NoFit:
     """Fit the sphere of a stated radius near a centre (3,); its pixels then determine a free
-    radius as well."""
+    radius as well. ``most_px``: about so many of its pixels are looked at."""
     centre_m = np.asarray(start_m, float)
     ranges_m = image.range_m.ravel()
     rays = image.rays.reshape(-1, 3)
     limit_m = WIDEST * radius_m
     near = disc(image, centre_m, 2 * radius_m)
+    if most_px is not None:
+        # the wider disc has some four times as many
+        near = near[:: len(near) // (4 * most_px) + 1]
     for _ in range(12):
         pixels = disc(image, centre_m, radius_m, near)
         present = pixels[np.isfinite(ranges_m[pixels])]
@@ -370,8 +381,10 @@ def find_spheres(image: RangeImage, radius_m: float) -> list[SphereFit]:
         known = [np.linalg.norm(fit.centre_m - start_m) < radius_m for fit in fits]
         if any(known):
             continue
-        fit = fit_sphere(image, start_m, radius_m)
-        if isinstance(fit, NoFit) or abs(fit.radius_m / radius_m - 1) > WIDEST:
+        fit = fit_sphere(image, start_m, radius_m, most_px=SCREENED_PX)
+        if isinstance(fit, SphereFit):
+            fit = fit_sphere(image, fit.centre_m, radius_m)
+        if isinstance(fit, NoFit) or not _has_size(fit):
             continue
         apart_m = [np.linalg.norm(fit.centre_m - other.centre_m) for other in fits]
         if min(apart_m, default=np.inf) > 1.5 * radius_m:
@@ -379,6 +392,13 @@ def find_spheres(image: RangeImage, radius_m: float) -> list[SphereFit]:
         if len(fits) == MOST_SPHERES:
             break
     return sorted(fits, key=lambda fit: float(np.linalg.norm(fit.centre_m)))
+
+
+def _has_size(fit: SphereFit) -> bool:
+    """Return whether a free radius is determined, and agrees with the stated one."""
+    sigma = fit.radius_sigma_m / fit.stated_m
+    off = abs(fit.radius_m / fit.stated_m - 1)
+    return sigma <= LOOSEST and off <= OTHER_SIZE + 3 * sigma
 
 
 def _candidates(image: RangeImage, radius_m: float) -> Iterator[np.ndarray]:

@@ -7,11 +7,15 @@ many of the intervals hold the truth. Each camera takes 12 frames of 240 x 224 p
 1 mm of noise; each draw is another unit with another fixed pattern and other noise."""
 
 import argparse
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from harness.evaluation.intervals import Interval
 from harness.programs.camera import characterise

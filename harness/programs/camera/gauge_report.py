@@ -56,6 +56,8 @@ WIDTH_10_90 = 2.563
 """Width of a Gaussian edge between 10 and 90 % of its step, in standard deviations."""
 SEEN = 5.0
 """Signal over noise at which a pocket counts as seen."""
+WORST_SHOWN_MM = 10.0
+"""Residual beyond which the colours end: the outline, where what lies behind is mixed in."""
 
 
 @dataclass(frozen=True)
@@ -238,9 +240,9 @@ def _of_edges(blur: Blur | None) -> Iterator[GaugeFigure]:
     value = Estimate(blur.blur_px, ends.low, ends.high)
     meaning = "standard deviation of the Gaussian that gives edges as captured"
     yield GaugeFigure("blur at edges", "steps, grooves, pockets", "px", value, meaning)
-    wide = (WIDTH_10_90 * end for end in (blur.blur_px, ends.low, ends.high))
+    wide = Estimate(WIDTH_10_90 * blur.blur_px, WIDTH_10_90 * ends.low, WIDTH_10_90 * ends.high)
     meaning = "edge response from 10 to 90 % of a step"
-    yield GaugeFigure("edge width", "steps, grooves, pockets", "px", Estimate(*wide), meaning)
+    yield GaugeFigure("edge width", "steps, grooves, pockets", "px", wide, meaning)
     meaning = "share of pixels with a range at edges, over that beside them"
     fill = Estimate(blur.fill)
     yield GaugeFigure("fill at edges", "steps, grooves, pockets", "1", fill, meaning)
@@ -371,7 +373,9 @@ def _residual_picture(reading: GaugeReading) -> str:
 
     def draw(canvas: Figure) -> None:
         axes = canvas.subplots()
-        drawn = axes.imshow(cut, cmap="RdBu_r", norm=residual_norm(cut))
+        drawn = axes.imshow(
+            cut, cmap="RdBu_r", norm=residual_norm(cut[np.abs(cut) < WORST_SHOWN_MM])
+        )
         axes.set(xticks=[], yticks=[])
         residual_bar(canvas, drawn, "range minus gauge, mm", ax=axes)
 
