@@ -93,7 +93,7 @@ def test_only_the_hole_departs_from_each_reference(damaged: Board, hole_free: Bo
 
 
 SWEPT = (
-    "sweep={reference: [null, {kind: scan}, {kind: good_parts, parts: 2},"
+    "sweep={compared_with: [null, {kind: scan}, {kind: good_parts, parts: 2},"
     " {kind: good_parts, parts: 3}, {kind: mesh}]}"
 )
 
@@ -151,11 +151,11 @@ def test_a_point_without_a_reference_keeps_its_digest(tmp_path: Path) -> None:
     [
         ("detector.name=plane_ransac", "has no surface setting"),
         ("study=null", "a reference needs a study of single views"),
-        ("reference={kind: good_parts, parts: 0}", "parts"),
+        ("compared_with={kind: good_parts, parts: 0}", "parts"),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, changed: str, expected: str) -> None:
     (tmp_path / "tiny.yaml").write_text(STUDY)
     with pytest.raises(DeclarationError) as message:
-        load_experiment(tmp_path / "tiny.yaml", ["reference={kind: scan}", changed])
+        load_experiment(tmp_path / "tiny.yaml", ["compared_with={kind: scan}", changed])
     assert expected in str(message.value)
