@@ -16,6 +16,7 @@ from harness.experiment.schema import (
     ScanReference,
 )
 from harness.runs.plan import Group, plan_of
+from harness.runs.tables import _variants
 from harness.trials.board import Board
 from harness.trials.clouds import TrialPoint, ViewClouds
 from harness.trials.references import ReferenceBoards
@@ -141,6 +142,9 @@ def test_a_point_without_a_reference_keeps_its_digest(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(STUDY)
     plain = load_experiment(tmp_path / "tiny.yaml", ["detector.name=local", "sweep={}"])
     compared = load_experiment(tmp_path / "tiny.yaml", ["detector.name=local", SWEPT])
+    tables = _variants(compared)
+    assert tables["compared_with"].tolist()[:2] == ["null", '{"kind": "scan"}']
+    assert (tables["reference"] == tables["variant"]).all()  # what a variation varies
     digests = [point.digest for point in compared.points]
     assert plain.points[0].digest == digests[0]
     assert len(set(digests)) == 5
