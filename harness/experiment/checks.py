@@ -81,9 +81,9 @@ def resolved(source: Source) -> tuple[ExperimentConfig | None, list[Problem]]:
 
 def _reference_problems(config: ExperimentConfig, source: Source) -> Iterator[Problem]:
     """Find what a board cannot be compared with a reference in."""
-    if config.reference is None:
+    if config.compared_with is None:
         return
-    position = source.key_place_of(("reference",))
+    position = source.key_place_of(("compared_with",))
     if config.study is None or config.mapping is not None:
         fix = "add study: {boards: 10, hole_free_boards: 10}, without source.views"
         yield Problem("a reference needs a study of single views", position, fix=fix)

@@ -299,7 +299,7 @@ class ExperimentConfig(Config):
     source: Annotated[SimulatedSource | CaptureSource, Field(discriminator="kind")]
     capture: CaptureConfig
     mapping: MappingConfig | None = Field(None, description="how several views become one cloud")
-    reference: AnyReference | None = Field(
+    compared_with: AnyReference | None = Field(
         None,
         description="in a study of single views: what each board is compared with, by the same "
         "camera and number of frames; null: a surface that is fitted to it",
@@ -339,7 +339,7 @@ class ExperimentConfig(Config):
     @property
     def detector_settings(self) -> dict[str, Any]:
         """The detector's settings; with a reference, its surface is what that says."""
-        if self.reference is None:
+        if self.compared_with is None:
             return self.detector.settings
         return {**self.detector.settings, "surface": {"shape": "expected"}}
 
@@ -489,9 +489,9 @@ def point_of(
         }
         frames |= {} if source.views is None else {"views": source.views.to_data()}
     numbers = {key: value for key, value in config.to_data().items() if key not in SHARED_BY_POINTS}
-    if config.reference is None:
+    if config.compared_with is None:
         # points without one keep their digests
-        del numbers["reference"]
+        del numbers["compared_with"]
     numbers |= {"source": frames, "detector_version": detector_version(config)}
     offer = DETECTORS.offer(config.detector.name)
     numbers |= {} if offer.built_in else {"detector_from": offer.origin}

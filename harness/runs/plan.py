@@ -331,7 +331,7 @@ def trial_point(point: Point, threshold: float | None, learned: str | None) -> T
             learned=learned,
         ),
         mapping=config.mapping,
-        reference=config.reference,
+        reference=config.compared_with,
     )
 
 
@@ -506,7 +506,7 @@ class _StudyBoards:
 
     @property
     def _references(self) -> list[AnyReference | None]:
-        return [point.config.reference for point in self.points]
+        return [point.config.compared_with for point in self.points]
 
     @cached_property
     def _good_parts(self) -> list[Batch]:

@@ -16,6 +16,7 @@ from harness.experiment.schema import (
     ScanReference,
 )
 from harness.runs.plan import Group, plan_of
+from harness.runs.tables import _variants
 from harness.trials.board import Board
 from harness.trials.clouds import TrialPoint, ViewClouds
 from harness.trials.references import ReferenceBoards
@@ -93,7 +94,7 @@ def test_only_the_hole_departs_from_each_reference(damaged: Board, hole_free: Bo
 
 
 SWEPT = (
-    "sweep={reference: [null, {kind: scan}, {kind: good_parts, parts: 2},"
+    "sweep={compared_with: [null, {kind: scan}, {kind: good_parts, parts: 2},"
     " {kind: good_parts, parts: 3}, {kind: mesh}]}"
 )
 
@@ -141,6 +142,9 @@ def test_a_point_without_a_reference_keeps_its_digest(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(STUDY)
     plain = load_experiment(tmp_path / "tiny.yaml", ["detector.name=local", "sweep={}"])
     compared = load_experiment(tmp_path / "tiny.yaml", ["detector.name=local", SWEPT])
+    tables = _variants(compared)
+    assert tables["compared_with"].tolist()[:2] == ["null", '{"kind": "scan"}']
+    assert (tables["reference"] == tables["variant"]).all()  # what a variation varies
     digests = [point.digest for point in compared.points]
     assert plain.points[0].digest == digests[0]
     assert len(set(digests)) == 5
@@ -151,11 +155,11 @@ def test_a_point_without_a_reference_keeps_its_digest(tmp_path: Path) -> None:
     [
         ("detector.name=plane_ransac", "has no surface setting"),
         ("study=null", "a reference needs a study of single views"),
-        ("reference={kind: good_parts, parts: 0}", "parts"),
+        ("compared_with={kind: good_parts, parts: 0}", "parts"),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, changed: str, expected: str) -> None:
     (tmp_path / "tiny.yaml").write_text(STUDY)
     with pytest.raises(DeclarationError) as message:
-        load_experiment(tmp_path / "tiny.yaml", ["reference={kind: scan}", changed])
+        load_experiment(tmp_path / "tiny.yaml", ["compared_with={kind: scan}", changed])
     assert expected in str(message.value)
