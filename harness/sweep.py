@@ -26,8 +26,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     )
     add("--calibration", type=Path, metavar="FILE", help=help)
     help = (
-        "a first look within a minute: at most 5 repeats, a third of a study's boards, fewer "
-        "values on long axes, no sensitivity; wider intervals"
+        "a first look: at most 5 repeats, a third of a study's boards, few values of long axes, "
+        "no sensitivity; wider intervals"
     )
     add("--quick", action="store_true", help=help)
     add(
