@@ -15,6 +15,9 @@ EXPERIMENT = "atlas"
 """The experiment of one part."""
 NEAREST_M = 0.3
 FARTHEST_M = 3.0
+COARSEST_PX_MM = 8.0
+"""Width of a pixel on the target beyond which nothing is computed: boards of as many pixels would
+be wider than 1.2 m, and only damage of several centimetres be found."""
 DARK = 0.1
 BRIGHT = 0.9
 FRAMES = (1, 50)

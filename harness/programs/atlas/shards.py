@@ -12,6 +12,7 @@ from harness.programs.atlas.parts import (
     CHECK_FRAMES,
     CHECK_SHARE,
     CHECKED,
+    COARSEST_PX_MM,
     DARK,
     DEPTHS_MM,
     FARTHEST_M,
@@ -113,7 +114,8 @@ def measured_noise(name: str) -> PlaneNoise:
     """Return the depth noise of a camera from simulated frames of an even plane."""
     camera = load_camera(name)
     nearest_m = max(NEAREST_M, camera.optics.nearest_m)
-    farthest_m = min(FARTHEST_M, camera.optics.farthest_m)
+    focal_px = float(camera.nominal_lens.fx)
+    farthest_m = min(FARTHEST_M, camera.optics.farthest_m, COARSEST_PX_MM * MM * focal_px)
     # the ends belong to the range, and boards are tilted and moved: a margin of a twentieth
     if nearest_m > NEAREST_M:
         nearest_m *= 1.05
