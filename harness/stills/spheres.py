@@ -4,8 +4,8 @@ rays.
 Fit. Noise acts along the ray, so the sum of squares of (measured range - range at which the ray
 meets the sphere) is minimised, which a radial distance would bias. Weights are the squared cosine
 of incidence, as noise grows with its inverse. Only pixels within `STEEPEST_DEG` of incidence and
-`RIM_PX` inside the silhouette count: further out, a pixel also sees what lies behind. The centre is
-that of a sphere with the stated diameter, unless the diameter is free. Errors are those of the
+`RIMS_PX` inside the silhouette count: further out, a pixel also sees what lies behind. The centre
+is that of a sphere with the stated diameter, unless the diameter is free. Errors are those of the
 residuals, with the correlation of neighbours; errors that a whole sphere shares are not in them.
 Not modelled: light between the sphere and its surroundings, and a lens that is wrong."""
 
@@ -21,8 +21,11 @@ from scipy import special
 from harness.evaluation.intervals import UPPER, Interval
 
 STEEPEST_DEG = 60.0
-RIM_PX = 2.5
-"""A blur of 0.6 pixels puts 0.6 % of what lies behind into pixels 1.5 inside, and none there."""
+RIM_SHARE = 0.15
+RIMS_PX = (1.5, 2.5)
+"""Margin inside the silhouette: a share of its radius, within these limits. A blur of 0.6 pixels
+puts 0.6 % of what lies behind into pixels 1.5 inside, and none into those 2.5 inside; on small
+spheres, whose noise is larger, the wider margin would leave too few."""
 FEWEST_PX = 40
 """Pixels that a fit of four numbers needs."""
 LEAST_SHARE = 0.2
@@ -53,7 +56,7 @@ LEAST_EVIDENCE = 20.0
 """Least logarithm of the likelihood of a sphere over that of a plane, which has as many free
 numbers; among the 3e5 places of an image, noise alone reaches 13."""
 MOST_SPHERES = 12
-LOOSEST = 0.1
+LOOSEST = 0.13
 """Largest relative error of a free radius: pieces of edges and noise do not determine one."""
 OTHER_SIZE = 0.1
 """Relative difference of radii from which a sphere is another one, beside three of its errors."""
@@ -67,7 +70,7 @@ def farthest_m(pitch_rad: float, radius_m: float) -> float:
     disc_px = np.sqrt(FEWEST_PX / np.pi)
     # all angles are small there
     by_incidence = radius_m * np.sin(np.radians(STEEPEST_DEG)) / (disc_px * pitch_rad)
-    by_rim = radius_m / ((disc_px + RIM_PX) * pitch_rad)
+    by_rim = radius_m / ((disc_px + RIMS_PX[0]) * pitch_rad)
     return float(min(by_incidence, by_rim))
 
 
@@ -192,7 +195,8 @@ def disc(
         rays = rays[near]
     by_incidence = radius_m * np.sin(np.radians(STEEPEST_DEG)) / away_m
     silhouette_rad = np.arcsin(radius_m / away_m)
-    by_rim = np.sin(max(silhouette_rad - RIM_PX * image.pitch_rad, 0.0))
+    rim_px = np.clip(RIM_SHARE * silhouette_rad / image.pitch_rad, *RIMS_PX)
+    by_rim = np.sin(max(silhouette_rad - rim_px * image.pitch_rad, 0.0))
     cosine = np.sqrt(1 - min(by_incidence, by_rim) ** 2)
     with np.errstate(invalid="ignore"):
         pixels = np.flatnonzero(rays @ centre_m >= cosine * away_m)
@@ -368,7 +372,7 @@ def correlated_pixels(
         product = float((picture * np.roll(picture, shift, (0, 1))).sum())
         total += product / max(pairs, 1.0) / variance
     lost = numbers * len(lags) ** 2 / count
-    return max(total / (1 - min(lost, 0.5)), 1.0)
+    return max(total / (1 - min(lost, 0.3)), 1.0)
 
 
 # ---------------------------------------------------------------- where spheres are

@@ -41,10 +41,11 @@ if TYPE_CHECKING:
 
 RULE = (
     f"A sphere is fitted along the rays, to pixels within {STEEPEST_DEG:g} degrees of incidence "
-    "and 2.5 pixels inside its silhouette. Size (PS) is the diameter of the best sphere minus the "
-    "stated one, form (PF) the width of the shell that holds 99.7 % (VDI/VDE 2634-2) or 95 % (ISO "
-    "10360-13) of the points; spacings are those of centres with the stated diameter. Intervals of "
-    "95 % hold the noise that the average keeps, not errors that a whole sphere shares."
+    "and 1.5 to 2.5 pixels inside its silhouette. Size (PS) is the diameter of the best sphere "
+    "minus the stated one, form (PF) the width of the shell that holds 99.7 % (VDI/VDE 2634-2) or "
+    "95 % (ISO 10360-13) of the points; spacings are those of centres with the stated diameter. "
+    "Intervals of 95 % hold the noise that the average keeps, not errors that a whole sphere "
+    "shares."
 )
 
 

@@ -78,7 +78,7 @@ def test_too_few_pixels_give_no_number():
     assert isinstance(fit, NoFit)
     assert fit.why == "39 pixels with a range, 40 needed"
     left = image.range_m.copy()
-    left.ravel()[on_sphere[on_sphere % LENS.width > 60]] = np.nan
+    left.ravel()[on_sphere[on_sphere % LENS.width > 57]] = np.nan
     fit = fit_sphere(RangeImage(left, image.rays), CENTRES_M[0], RADIUS_M)
     assert isinstance(fit, NoFit)
     assert fit.why == "its pixels lie on one side of it"
