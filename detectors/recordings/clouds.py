@@ -137,7 +137,7 @@ LZF_STRONGEST = 100  # largest compression factor of LZF: three bytes represent 
 
 
 class Header(NamedTuple):
-    """What the header of a PLY or PCD states."""
+    """Statements of the header of a PLY or PCD."""
 
     # pixels of the grid; height 1 without one
     width: int
