@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from detectors.rigid_motion import displacement_jacobian, moved_by
 from detectors.surfaces.expected import Triangles, normals_of
+from detectors.surfaces.triangle_tree import first_hits
 from harness.evaluation.intervals import Interval
 from harness.stills.solid_body import solid_of
 from harness.stills.solid_gauge import SolidGauge
@@ -338,10 +339,14 @@ def seen_ranges_m(triangles: Triangles, rays: np.ndarray, T_camera_gauge: np.nda
     """Return the range (h, w) at which rays (h, w, 3) meet the gauge, NaN beside it."""
     T_gauge_camera = invert(T_camera_gauge)
     directions = rotate_vectors(T_gauge_camera, np.nan_to_num(rays))
-    starts = np.broadcast_to(T_gauge_camera[:3, 3], directions.shape)
-    cast = np.concatenate([starts, directions], axis=-1).astype(np.float32)
-    met = triangles.scene.cast_rays(cast)["t_hit"].numpy().astype(float)
-    return np.where(np.isfinite(met) & np.isfinite(rays[..., 0]), met, np.nan)
+    flat = directions.reshape(-1, 3)
+    camera_m = np.broadcast_to(T_gauge_camera[:3, 3], flat.shape)
+    triangle, shares = first_hits(triangles.tree, camera_m, flat)
+    places_m = np.einsum("nc,ncd->nd", shares, triangles.corners_m[triangle])
+    range_m = np.linalg.norm(places_m - camera_m, axis=1)
+    range_m[triangle < 0] = np.nan
+    is_ray = np.isfinite(rays[..., 0])
+    return np.where(is_ray, range_m.reshape(is_ray.shape), np.nan)
 
 
 def blurred(range_m: np.ndarray, blur_px: float) -> np.ndarray:
