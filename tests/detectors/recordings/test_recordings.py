@@ -667,12 +667,11 @@ def test_record3d_keeps_its_depth_compressed(tmp_path: Path) -> None:
     recording = open_capture([plane.write_r3d(tmp_path / "a.r3d", 2)])
     frame = next(recording.frames())
     np.testing.assert_allclose(points_of(recording, frame), TRUE_M, atol=1e-6)
-    assert recording.warnings == ()
+    (warning,) = recording.warnings
+    assert "the first two frames are equal" in warning, "they have no noise"
     assert len(list(recording.frames())) == 2
-    assert (
-        "moved by 50 mm"
-        in open_capture([plane.write_r3d(tmp_path / "b.r3d", 2, step_m=0.05)]).warnings[0]
-    )
+    moved = open_capture([plane.write_r3d(tmp_path / "b.r3d", 2, step_m=0.05)])
+    assert any("moved by 50 mm" in text for text in moved.warnings)
 
 
 def test_the_raw_frame_of_a_plane(shared_data: Path) -> None:
