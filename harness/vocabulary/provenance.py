@@ -167,8 +167,16 @@ def source_digest(modules: tuple[str, ...], packages: tuple[str, ...]) -> str:
         state.update(f"{shown} {len(content)}\n".encode())
         state.update(content)
     for package in packages:
-        state.update(f"{package} {importlib.metadata.version(package)}\n".encode())
+        state.update(f"{package} {_installed_version(package)}\n".encode())
     return state.hexdigest()
+
+
+def _installed_version(package: str) -> str:
+    """Return a package's version, or ``absent``: nothing of an extra that is not installed runs."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "absent"
 
 
 @lru_cache

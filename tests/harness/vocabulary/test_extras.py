@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.vocabulary import extras
+from harness.vocabulary import extras, provenance
 from harness.vocabulary.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -35,3 +35,10 @@ def test_a_module_that_an_import_refuses_is_missing(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with pytest.raises(UserError, match="openpyxl"):
         extras.load_extra("openpyxl", "a test")
+
+
+def test_the_digest_of_code_does_without_an_extra() -> None:
+    code = ("harness.vocabulary.seeds",)
+    absent = provenance.source_digest(code, ("no-such-package",))
+    assert absent != provenance.source_digest(code, ("numpy",))
+    assert absent == provenance.source_digest(code, ("no-such-package",))
