@@ -10,7 +10,7 @@ import pytest
 
 from detectors import load_detector
 from detectors.surfaces.expected import KnownPose
-from detectors.surfaces.scans import good_parts, laid_under, placed, scan_of
+from detectors.surfaces.scans import _scatter, good_parts, laid_under, placed, scan_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM, invert, transform_points
 from tests.support import made_parts
@@ -77,6 +77,29 @@ def test_marks_place_what_the_surface_does_not() -> None:
     assert stated_m[2] < 0.005 * MM  # by the surface
     shift_m = (found.T_part_camera @ invert(T_EARLIER_NOW))[:3, 3]
     assert np.abs(shift_m).max() < 0.2 * MM
+
+
+def test_pixels_that_share_their_noise_place_a_part_less_well() -> None:
+    """Of nine pixels that share their noise, one counts."""
+    cloud, mask = cloud_of(MadePart(), TURNED, seed=2)
+    points_m = cloud.points_m[mask]
+    alone_m = laid_under(SCAN, cloud, mask).registration_at(points_m)
+    shared = replace(cloud, noise_reach_px=3.0)
+    shared_m = laid_under(SCAN, shared, mask).registration_at(points_m)
+    assert np.nanmedian(shared_m / alone_m) == pytest.approx(3.0, rel=0.1)
+
+
+def test_the_scatter_of_a_place_is_drawn_towards_that_of_all_places() -> None:
+    """Two parts beyond the first differ by 1 mm, but in a block of 9 x 9 places not at all. In its
+    middle, the usual scatter counts like three further parts."""
+    rows, columns = np.mgrid[:30, :30]
+    rays = 0.01 * np.column_stack([rows.ravel(), columns.ravel()])
+    is_equal = ((np.abs(rows - 15) <= 4) & (np.abs(columns - 15) <= 4)).ravel()
+    squares_m2 = np.where(is_equal, 0.0, 2.0 * MM**2)
+    variance_m2 = _scatter(rays, squares_m2, np.full(900, 2.0)).reshape(30, 30)
+    typical_mm2 = 1 - 81 / 900
+    assert variance_m2[15, 15] / MM**2 == pytest.approx(3 / 5 * typical_mm2)
+    assert variance_m2[5, 5] / MM**2 == pytest.approx((2 + 3 * typical_mm2) / 5)
 
 
 def test_good_parts_state_where_parts_differ() -> None:

@@ -106,6 +106,9 @@ def test_a_batch_is_as_large_as_the_width_asks_for():
     assert len(after(twelve, Stub((4.0, 5.0), (6.0, 6.6))).chosen_mm) - 6 == 6
     assert len(after(twelve, Stub((4.0, 5.0), (6.0, 6.59))).chosen_mm) - 6 == 5
     assert len(after(twelve, Stub((4.0, 5.0), (6.0, 6.51))).chosen_mm) - 6 == LEAST_BATCH
+    # of several set-ups, the widest asks for most
+    two_wide = (Stub((4.0, 5.0), (6.0, 6.51)), Stub((8.0, 8.5), (9.0, 9.6), "other"))
+    assert len(after(twelve, *two_wide).chosen_mm) - 6 == 6
     few_left = replace(twelve, most_boards=14)
     assert after(few_left, WIDE).boards == 14
 
