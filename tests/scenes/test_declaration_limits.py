@@ -138,6 +138,9 @@ HoleConfig.chamfer_mm [0,100] 0.0
 ListedViews.guess_error_deg [0,45] 3.0
 ListedViews.guess_error_mm [0,500] 10.0
 ListedViews.seed [0,4294967295] 1
+MadeConfig.form_mm [0,20] 0.3
+MadeConfig.sizes_percent [0,20] 1.0
+MadeConfig.seed [0,9223372036854775807] 1
 MaterialConfig.albedo_850 [0,1] 0.6
 MaterialConfig.rgb [0,1] [0.55,0.42,0.28]
 MaterialConfig.grain_contrast [0,0.3] 0.05

@@ -57,6 +57,7 @@ REFERENCES = (
 )
 
 
+@pytest.mark.slow
 def test_only_the_hole_departs_from_each_reference(damaged: Board, hole_free: Board) -> None:
     points = tuple(compared_with(reference) for reference in REFERENCES)
     undamaged = reference_of(hole_free)

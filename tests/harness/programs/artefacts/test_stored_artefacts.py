@@ -28,9 +28,10 @@ OF_FACTS = {
     "| | Azure Kinect NFOV | Kinect v2 | RealSense L515 |",
     "| files | basis |",
     "| what | size |",
+    "| platform | light | `sim` | `open3d` | `cluster` | `excel` | `peers` |",
 }
-"""First lines of tables whose numbers no code of tofpod computes: of camera files, and of sizes of
-files."""
+"""First lines of tables whose numbers no code of tofpod computes: of camera files, of sizes of
+files, and of packages in the index."""
 SHARE_OF_NUMBERS = 0.4
 REPAIR = "declare it in artefacts.yaml and put markers around or after it; see CONTRIBUTING.md"
 
