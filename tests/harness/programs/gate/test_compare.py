@@ -476,7 +476,7 @@ def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
     assert only_row(first, lucky).signal.error > 1.2 * deviation
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.1])
+@pytest.mark.parametrize("slip", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_signals_under_another_draw_of_the_noise_are_as_rarely_weaker_as_the_test_says(slip):
     """``slip``: deviation by which hits do not follow the signals, as a score over several pixels
     does not."""
