@@ -124,9 +124,11 @@ def set_ups_of(limits: pd.DataFrame, part: Part) -> list[SetUp]:
     set_ups = []
     for row in limits.to_dict("records"):
         kind, depth_mm = damage_of(row[DAMAGE])
+        # an axis of one value is no column
+        albedo = row[ALBEDO] if len(part.albedos) > 1 else part.albedos[0]
         conditions = Conditions(
             distance_m=part.distance_m,
-            albedo=float(row[ALBEDO]),
+            albedo=float(albedo),
             frames=int(row["frames"]),
             depth_mm=None if depth_mm != depth_mm else depth_mm,
         )
