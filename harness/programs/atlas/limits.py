@@ -170,6 +170,8 @@ class Answer:
 
     def verdict(self, size_mm: float) -> str:
         """Return whether damage of this size is found 9 times out of 10: yes, no or undecided."""
+        if self.found_mm <= self.missed_mm:
+            return "undecided"  # set-ups contradict one another
         if self.high_mm <= size_mm or self.found_mm <= size_mm:
             return "yes"
         return "no" if self.low_mm > size_mm or self.missed_mm >= size_mm else "undecided"

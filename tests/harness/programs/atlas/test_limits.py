@@ -125,3 +125,9 @@ def test_the_error_is_that_of_set_ups_left_out():
 )
 def test_a_verdict_on_5_mm(answer: Answer, verdict: str):
     assert answer.verdict(5.0) == verdict
+
+
+def test_bounds_that_contradict_one_another_decide_nothing():
+    contradicted = Answer(found_mm=4.0, missed_mm=6.0)
+    assert [contradicted.verdict(size_mm) for size_mm in (3.0, 5.0, 7.0)] == ["undecided"] * 3
+    assert Answer(found_mm=4.0, missed_mm=3.0).verdict(5.0) == "yes"
