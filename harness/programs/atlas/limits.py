@@ -170,8 +170,6 @@ class Answer:
 
     def verdict(self, size_mm: float) -> str:
         """Return whether damage of this size is found 9 times out of 10: yes, no or undecided."""
-        if self.found_mm <= self.missed_mm:
-            return "undecided"  # set-ups contradict one another
         if self.high_mm <= size_mm or self.found_mm <= size_mm:
             return "yes"
         return "no" if self.low_mm > size_mm or self.missed_mm >= size_mm else "undecided"
@@ -267,6 +265,8 @@ class LimitSurface:
         known = Answer(
             found_mm=min(found_mm, default=np.nan), missed_mm=max(missed_mm, default=np.nan)
         )
+        if known.found_mm <= known.missed_mm:
+            return Answer()  # set-ups contradict one another
         if self.fit is None or missed_mm or not self._is_between(x, conditions, harder):
             return known
         middle, half = self.fit.log_a90(x, float(np.log(conditions.distance_m)))

@@ -127,7 +127,16 @@ def test_a_verdict_on_5_mm(answer: Answer, verdict: str):
     assert answer.verdict(5.0) == verdict
 
 
-def test_bounds_that_contradict_one_another_decide_nothing():
-    contradicted = Answer(found_mm=4.0, missed_mm=6.0)
-    assert [contradicted.verdict(size_mm) for size_mm in (3.0, 5.0, 7.0)] == ["undecided"] * 3
-    assert Answer(found_mm=4.0, missed_mm=3.0).verdict(5.0) == "yes"
+def test_bounds_that_contradict_one_another_are_none():
+    """Far away all of 4 mm was found, and near by, which is easier, 6 mm was missed."""
+    whole = surface()
+    set_ups = []
+    for set_up in whole.set_ups:
+        if set_up.conditions.distance_m == 0.3:
+            set_up = replace(set_up, a90_mm=math.nan, hits=0, largest_mm=6.0)
+        if set_up.conditions.distance_m == 2.7:
+            set_up = replace(set_up, is_at_most=True, smallest_mm=4.0)
+        set_ups.append(set_up)
+    answer = replace(whole, set_ups=tuple(set_ups)).at(Conditions(0.9, 0.5, 10))
+    assert answer == pytest.approx(Answer(), nan_ok=True)
+    assert answer.verdict(5.0) == "undecided"
