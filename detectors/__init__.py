@@ -56,10 +56,10 @@ def detector_type(name: str) -> Any:
         raise DETECTORS.broken(
             offer, "it has no `settings_type` that is a harness.vocabulary.config.Config"
         )
-    called = getattr(kind, "name", None)
-    if isinstance(called, str) and called != name:
+    own_name = getattr(kind, "name", None)
+    if isinstance(own_name, str) and own_name != name:
         # results use the detector's own name, experiments that of its entry point
-        raise DETECTORS.broken(offer, f"it is called {called!r}, but offered as {name!r}")
+        raise DETECTORS.broken(offer, f"it is called {own_name!r}, but offered as {name!r}")
     return kind
 
 

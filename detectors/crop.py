@@ -75,7 +75,7 @@ MOST_SAMPLES = 20_000  # points from which a surface's plane and extent are comp
 class Candidate:
     """A surface that may be the target."""
 
-    own: np.ndarray
+    mask: np.ndarray
     """(h, w) bool on the choice's ``grid``: its pixels."""
     filled: np.ndarray
     """(h, w) bool: its pixels and all that they enclose."""
@@ -86,7 +86,7 @@ class Candidate:
     @property
     def share(self) -> float:
         """Share of all pixels."""
-        return float(self.own.mean())
+        return float(self.mask.mean())
 
     @cached_property
     def depths_m(self) -> tuple[float, float, float]:
@@ -118,10 +118,10 @@ class Candidate:
     def weight(self) -> float:
         """Share of the pixels, weighted by a Gaussian about the picture's centre and reduced at a
         grazing angle."""
-        height, width = self.own.shape
+        height, width = self.mask.shape
         rows = _centre_weights(height)
         columns = _centre_weights(width)
-        weighted = float(rows @ self.own @ columns / (rows.sum() * columns.sum()))
+        weighted = float(rows @ self.mask @ columns / (rows.sum() * columns.sum()))
         return weighted * min(1.0, (self._facing / GRAZING) ** 2)
 
     @cached_property
@@ -158,7 +158,7 @@ class Candidate:
     @cached_property
     def _sample_m(self) -> np.ndarray:
         """An even sample (n, 3) of its points."""
-        pixels = np.flatnonzero(self.own)
+        pixels = np.flatnonzero(self.mask)
         step = max(1, len(pixels) // MOST_SAMPLES)
         return self.grid.points_m.reshape(-1, 3)[pixels[::step]]
 
@@ -236,7 +236,7 @@ class _Comparison:
         """The surfaces' pixels and outlines."""
         self.grid = grid
         """The cloud, or its raster."""
-        self.numbers = range(len(surfaces.own))
+        self.numbers = range(len(surfaces.masks))
         """Numbers of all surfaces."""
         self.described: list[Candidate] = []
         """The surfaces as candidates, by number."""
@@ -244,13 +244,13 @@ class _Comparison:
         """By number, the borders of the surface's outline on others, by their numbers."""
         for number in self.numbers:
             filled = surfaces.filled[number]
-            self.described.append(Candidate(surfaces.own[number], filled, filled, grid))
+            self.described.append(Candidate(surfaces.masks[number], filled, filled, grid))
             self.borders.append(self._borders(number) if len(self.numbers) > 1 else {})
 
     def _borders(self, number: int) -> dict[int, _Border]:
         """Return the borders of this surface's outline on other surfaces, by their numbers."""
         surfaces = self.surfaces
-        distance_px, nearest = nearest_pixel(surfaces.own[number])
+        distance_px, nearest = nearest_pixel(surfaces.masks[number])
         around = (distance_px <= surfaces.reach_px + 3) & ~surfaces.filled[number]
         ring = np.flatnonzero(around)
         z_m = self.grid.points_m[..., 2].reshape(-1)
@@ -258,7 +258,7 @@ class _Comparison:
         outline = len(np.unique(seeds[ring]))
         borders = {}
         for neighbour in self.numbers:
-            pixels = ring[surfaces.own[neighbour].reshape(-1)[ring]]
+            pixels = ring[surfaces.masks[neighbour].reshape(-1)[ring]]
             part = len(np.unique(seeds[pixels])) / max(outline, 1)
             if neighbour == number or part < BORDERING:
                 continue
@@ -273,7 +273,7 @@ class _Comparison:
 
     def encloses(self, outer: int, inner: int) -> bool:
         """Return whether a surface is seen through the outline of another."""
-        inner_pixels = self.surfaces.own[inner]
+        inner_pixels = self.surfaces.masks[inner]
         enclosed = np.count_nonzero(inner_pixels & self.surfaces.filled[outer])
         return bool(enclosed >= ENCLOSED * np.count_nonzero(inner_pixels))
 
@@ -298,8 +298,8 @@ class _Comparison:
         nearness = that.depths_m[1] / max(this.depths_m[1], 1e-6)
         probability = _probability(weight**0.5 * facing**2 * nearness)
         first = _size_text(this)
-        other = _size_text(that)
-        why = f"a surface of {other} may be the target instead of that of {first}"
+        second = _size_text(that)
+        why = f"a surface of {second} may be the target instead of that of {first}"
         return probability, why
 
     def _in_front(self, front: int, back: int) -> tuple[float, str] | None:
@@ -312,7 +312,7 @@ class _Comparison:
         that = self.described[back]
         covered = f"{100 * this.share:.2g} % of the view"
         if self.encloses(front, back):
-            opening = that.own.sum() / max(this.filled.sum(), 1)
+            opening = that.mask.sum() / max(this.filled.sum(), 1)
             why = "a surface is seen through a large opening of another"
             return _probability(0.5 / max(opening, 1e-6)), why
         if border.part >= SURROUNDED and border.behind_m <= this.extent_m[1]:
@@ -353,8 +353,8 @@ class _Comparison:
             if probability >= 0.5 or border.behind_m > this.extent_m[0]:
                 nearest_m = this.depths_m[2] + border.behind_m / 2
                 nearer = self.grid.points_m[..., 2] < nearest_m
-                joined = surfaces.filled[neighbour] | (nearer & ~surfaces.own[number])
-                standing = parts_with(joined, surfaces.own[neighbour])
+                joined = surfaces.filled[neighbour] | (nearer & ~surfaces.masks[number])
+                standing = parts_with(joined, surfaces.masks[neighbour])
                 outline = outline & ~grown(standing, surfaces.reach_px)
         return outline
 

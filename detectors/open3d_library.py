@@ -33,10 +33,10 @@ def load_open3d() -> Any:
         )
         if package is None:
             raise
-        what = f"this needs Open3D, which cannot start: {error}"
+        problem = f"this needs Open3D, which cannot start: {error}"
         legal = ", ".join(DEBIAN_PACKAGES.values())
         legal = f"a system with the libraries of the Debian packages {legal}"
-        raise MissingLibrary(what, legal=legal, fix=f"apt install {package}") from error
+        raise MissingLibrary(problem, legal=legal, fix=f"apt install {package}") from error
     return open3d
 
 

@@ -97,8 +97,8 @@ class ScoreMapDetector(ABC, Generic[S]):
         falling = np.argsort(-scores, kind="stable")
         for count in (FIRST_TRIED * least, len(pixels)):
             highest = falling[:count]
-            places = self.places(cloud.points_m.reshape(-1, 3)[pixels[highest]])
-            _, strengths = self._clusters(places, scores[highest], [0.0])
+            coordinates = self.places(cloud.points_m.reshape(-1, 3)[pixels[highest]])
+            _, strengths = self._clusters(coordinates, scores[highest], [0.0])
             if strengths.max(initial=0.0) > 0.0:
                 return float(strengths.max())
         return 0.0

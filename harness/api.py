@@ -290,11 +290,12 @@ def filters(
     judging = import_module("harness.programs.filters.judging")
     functions = {}
     names = []
-    for given in filters:
-        name = given if isinstance(given, str) else given.__name__
-        names.append(name)
-        if not isinstance(given, str):
-            functions[name] = given
+    for entry in filters:
+        if isinstance(entry, str):
+            names.append(entry)
+        else:
+            names.append(entry.__name__)
+            functions[entry.__name__] = entry
     with functions_named(functions):
         overrides = [*changes, *([judging.filter_axis(names)] if names else [])]
         judging.refuse_other_studies(load_experiment(Path(experiment), overrides))

@@ -85,15 +85,15 @@ def unsteadiness(cloud: Cloud) -> str:
     if out <= MOST_LEFT_OUT * frames:
         return ""
     names = ", ".join(frame.name for frame in cloud.left_out[:MOST_NAMED])
-    more = ", .." if out > MOST_NAMED else ""
+    ellipsis = ", .." if out > MOST_NAMED else ""
     if out >= cloud.n_frames:
         used = "only one frame is" if cloud.n_frames == 1 else f"only {cloud.n_frames} are"
         return (
-            f"the {frames} frames do not show the same scene: {used} used, and {names}{more} left"
-            " out; name the frames of one scene only"
+            f"the {frames} frames do not show the same scene: {used} used, and {names}{ellipsis}"
+            " left out; name the frames of one scene only"
         )
     return (
-        f"{out} of {frames} frames differ from the others and are left out ({names}{more}): the"
+        f"{out} of {frames} frames differ from the others and are left out ({names}{ellipsis}): the"
         " camera or the scene moved"
     )
 
@@ -423,8 +423,8 @@ def _one_scene(stack: np.ndarray, change_m: float) -> np.ndarray:
     if rows * columns < FEWEST_BLOCKS:
         return np.ones(len(stack), bool)
     step = max(1, block_px // BLOCK_SAMPLES)
-    whole = stack[:, : rows * block_px, : columns * block_px]
-    blocks = whole.reshape(-1, rows, block_px, columns, block_px)[:, :, ::step, :, ::step]
+    cropped = stack[:, : rows * block_px, : columns * block_px]
+    blocks = cropped.reshape(-1, rows, block_px, columns, block_px)[:, :, ::step, :, ::step]
     samples = blocks.transpose(0, 1, 3, 2, 4).reshape(len(stack), rows * columns, -1)
     is_same = np.eye(len(stack), dtype=bool)
     for i, j in combinations(range(len(stack)), 2):
@@ -439,14 +439,14 @@ def _changed_share(first: np.ndarray, second: np.ndarray, change_m: float) -> fl
     be; 0 if it is below `OTHER_SCENE` or too few blocks have distances in both frames."""
     differences = first - second
     counts = np.isfinite(differences).sum(axis=1)
-    known = differences[2 * counts > differences.shape[1]]
-    if len(known) < FEWEST_BLOCKS:
+    compared = differences[2 * counts > differences.shape[1]]
+    if len(compared) < FEWEST_BLOCKS:
         return 0.0
-    of_blocks = pixel_medians(known.T)
+    of_blocks = pixel_medians(compared.T)
     moved_m = np.abs(of_blocks - np.median(of_blocks))
     if np.mean(moved_m > change_m) < OTHER_SCENE:
         return 0.0  # a larger limit leaves fewer still
-    scatter_m = _median_finite(np.abs(known - of_blocks[:, None])) / 0.6745
+    scatter_m = _median_finite(np.abs(compared - of_blocks[:, None])) / 0.6745
     return float(np.mean(moved_m > max(change_m, scatter_m)))
 
 

@@ -83,23 +83,23 @@ def refuse_unfit(
 ) -> None:
     """Raise UserError if a flat field must not correct a cloud, which is the average of the
     ``frames``, before the correction. ``name``: of the flat field."""
-    own = 0
+    in_field = 0
     offered = 0
     left_out = {frame.name for frame in cloud.left_out}
     sums_m = np.zeros((2, *cloud.valid.shape))
     counts = np.zeros((2, *cloud.valid.shape), int)
     for frame in frames:
-        own += frame_digest(frame) in field.frames
+        in_field += frame_digest(frame) in field.frames
         if frame.name in left_out or frame.z_m.shape != cloud.valid.shape:
             continue
         is_finite = np.isfinite(frame.z_m)
         sums_m[offered % 2] += np.where(is_finite, frame.z_m, 0.0)
         counts[offered % 2] += is_finite
         offered += 1
-    if own:
+    if in_field:
         raise UserError(
-            f"the flat field {name} was made from this capture: {own} of its frames are in both; "
-            "it would take the surface's own shape and damage away",
+            f"the flat field {name} was made from this capture: {in_field} of its frames are in"
+            " both; it would take the surface's own shape and damage away",
             legal="a flat field of other captures",
             fix=NOT_THIS,
         )
@@ -175,11 +175,11 @@ def _is_surely_rougher(maps: _Maps) -> bool:
 def places_doubt(cloud: Cloud, field: FlatField, name: str | Path) -> str:
     """Return a full sentence if a flat field may hold the shape of a corrected cloud's surface,
     else "". A flat field for which the camera moved holds no surface."""
-    places = np.zeros((0, 2)) if field.moved else shared_places(cloud, field)
-    if not len(places):
+    shared_px = np.zeros((0, 2)) if field.moved else shared_places(cloud, field)
+    if not len(shared_px):
         return ""
-    u, v = places[0]
-    count = "one place" if len(places) == 1 else f"{len(places)} places"
+    u, v = shared_px[0]
+    count = "one place" if len(shared_px) == 1 else f"{len(shared_px)} places"
     return (
         f"the flat field {name}, recorded from one position, and this capture stand out alike at"
         f" {count} as wide as damage (the clearest at pixel {u}, {v}): if both show the same"
@@ -202,13 +202,13 @@ def shared_places(cloud: Cloud, field: FlatField) -> np.ndarray:
     is_shared = (of_field * of_capture > 0) & (height > STANDS_OUT)
     is_shared &= np.abs(of_rest) < np.abs(of_capture) / 2
     count, labels = cv2.connectedComponents(is_shared.astype(np.uint8))
-    places = []
+    peaks = []
     for number in range(1, count):
         values = np.where(labels == number, height, -np.inf)
         row, column = np.unravel_index(int(values.argmax()), values.shape)
-        places.append((values[row, column], column + region[1].start, row + region[0].start))
-    places.sort(reverse=True)
-    return np.array([(u, v) for _, u, v in places], int).reshape(-1, 2)
+        peaks.append((values[row, column], column + region[1].start, row + region[0].start))
+    peaks.sort(reverse=True)
+    return np.array([(u, v) for _, u, v in peaks], int).reshape(-1, 2)
 
 
 def _striking(values_m: np.ndarray) -> np.ndarray:

@@ -117,8 +117,8 @@ def doubts(
 def _refuse_other(cloud: Cloud, field: FlatField) -> None:
     """Raise UserError if the cloud cannot be of the camera and mode of the flat field."""
     if not cloud.organised or cloud.projection != "central":
-        what = "a flat field corrects a camera's own pixels, and this cloud has no pixel grid"
-        raise UserError(what, fix="leave out the flat field, or name the capture's depth images")
+        problem = "a flat field corrects a camera's own pixels, and this cloud has no pixel grid"
+        raise UserError(problem, fix="leave out the flat field, or name the capture's depth images")
     lens = field.lens
     height, width = cloud.valid.shape
     if cloud.lens is not None:

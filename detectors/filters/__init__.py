@@ -119,7 +119,7 @@ def _loaded(name: str) -> Any:
         if not (isinstance(settings_type, type) and issubclass(settings_type, Config)):
             why = "it has no `settings_type` that is a harness.vocabulary.config.Config"
             raise FILTERS.broken(offer, why)
-        called = getattr(loaded, "name", None)
-        if isinstance(called, str) and called != name:
-            raise FILTERS.broken(offer, f"it is called {called!r}, but offered as {name!r}")
+        own_name = getattr(loaded, "name", None)
+        if isinstance(own_name, str) and own_name != name:
+            raise FILTERS.broken(offer, f"it is called {own_name!r}, but offered as {name!r}")
     return loaded

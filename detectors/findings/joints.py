@@ -339,8 +339,8 @@ def _on_lattice(
     similar = similar & slots.is_long
     first = int(np.flatnonzero(similar)[0])
     plane = plane_along(slots.along[first], slots.centres_m[similar].mean(axis=0))
-    places = slots.centres_m @ plane
-    reach_m = np.full(places.shape, float(np.median(slots.widths_m[similar])))
+    centres_on_plane_m = slots.centres_m @ plane
+    reach_m = np.full(centres_on_plane_m.shape, float(np.median(slots.widths_m[similar])))
     # the centre of a slot that the rim cuts lies up to half its length from the middle
     reach_m[slots.cut, 0] = 0.5 * float(slots.lengths_m[similar].max())
 
@@ -354,12 +354,12 @@ def _on_lattice(
         most_hits = 0
         best_move = None
         for start, end in pairs:
-            move = places[end] - places[start]
-            linked = _linked(places, reach_m, similar, move)[similar]
+            move = centres_on_plane_m[end] - centres_on_plane_m[start]
+            linked = _linked(centres_on_plane_m, reach_m, similar, move)[similar]
             hits = int(linked.sum())
             if hits <= most_hits or _is_along(move, moves, float(reach_m[first, 1])):
                 continue
-            is_judged = _are_judged(places[similar] + move, pixel_of, judged)
+            is_judged = _are_judged(centres_on_plane_m[similar] + move, pixel_of, judged)
             trials = int((is_judged | linked).sum())
             probability = chance_of_following(hits, trials, chance)
             if hits >= FOLLOWED * trials and probability * len(pairs) < CHANCE:
@@ -372,8 +372,8 @@ def _on_lattice(
         moves += [moves[0] + moves[1], moves[0] - moves[1]]
     result = np.zeros(len(similar), bool)
     for move in moves:
-        result |= _linked(places, reach_m, similar, move)
-        result |= _linked(places, reach_m, similar, -move)
+        result |= _linked(centres_on_plane_m, reach_m, similar, move)
+        result |= _linked(centres_on_plane_m, reach_m, similar, -move)
     return result
 
 

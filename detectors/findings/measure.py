@@ -504,9 +504,9 @@ def _means(picture: np.ndarray, side: int) -> np.ndarray:
     height = picture.shape[0] // side
     width = picture.shape[1] // side
     squares = picture[: height * side, : width * side].reshape(height, side, width, side)
-    known = np.isfinite(squares)
-    counts = known.sum(axis=(1, 3))
-    sums = np.where(known, squares, 0.0).sum(axis=(1, 3))
+    is_finite = np.isfinite(squares)
+    counts = is_finite.sum(axis=(1, 3))
+    sums = np.where(is_finite, squares, 0.0).sum(axis=(1, 3))
     return np.where(2 * counts >= side**2, sums / np.maximum(counts, 1), np.nan)
 
 

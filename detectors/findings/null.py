@@ -716,8 +716,10 @@ class Marks:
         right = min(int(columns.max()) + margin + 1, width)
         inside = np.zeros((bottom - top, right - left), bool)
         inside[rows - top, columns - left] = True
-        near = self.labels[top:bottom, left:right][grown(inside, margin, cv2.MORPH_ELLIPSE)]
-        counts = np.bincount(near, minlength=len(self.areas))[1:]
+        labels_nearby = self.labels[top:bottom, left:right][
+            grown(inside, margin, cv2.MORPH_ELLIPSE)
+        ]
+        counts = np.bincount(labels_nearby, minlength=len(self.areas))[1:]
         return bool(((counts > 0) & (counts < OWN_SHARE * self.areas[1:])).any())
 
 

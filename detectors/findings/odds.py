@@ -56,8 +56,8 @@ def noise_probabilities(
         else:
             null = evidence.notes["own_null"]
             threshold = null["threshold"]
-            place = group.split(", ")[0]
-            drawn = Tail.from_facts(null["tails"][place]).laws(LAWS)
+            zone = group.split(", ")[0]
+            drawn = Tail.from_facts(null["tails"][zone]).laws(LAWS)
             density = drawn.densities(scores[numbers])
             expected = drawn.expected(threshold)
         probabilities[numbers] = share_of_noise(scores[numbers], threshold, density, expected)
@@ -84,12 +84,12 @@ def _groups(
             continue
         peak = detection.pixels[np.argmax(scores[detection.pixels])]
         side = "behind" if is_behind[peak] else "in front"
-        place = PLAIN
+        zone = PLAIN
         if marks is not None and detection.kind == "depth" and marks.hold(detection):
-            place = MARKS
+            zone = MARKS
         elif RIM in tails and is_at_rim(evidence, detection):
-            place = RIM
-        groups.setdefault(f"{place}, {side}", []).append(number)
+            zone = RIM
+        groups.setdefault(f"{zone}, {side}", []).append(number)
     return groups
 
 
@@ -114,13 +114,13 @@ def share_of_noise(
     log_priors = 0.5 * np.log(numbers) - np.log1p(numbers)
     real = numbers / threshold * steepness * (scores[:, None] / threshold) ** -(steepness + 1.0)
     logs = np.empty((len(numbers), len(expected)))
-    for place in range(len(numbers)):
-        log_total = np.log(density + real[:, place]).sum(axis=1)
-        logs[place] = log_total - expected - numbers[place] + log_priors[place]
+    for row in range(len(numbers)):
+        log_total = np.log(density + real[:, row]).sum(axis=1)
+        logs[row] = log_total - expected - numbers[row] + log_priors[row]
     weights = np.exp(logs - special.logsumexp(logs))
     probabilities = np.zeros(len(scores))
-    for place in np.flatnonzero(weights.sum(axis=1) > NEGLIGIBLE).tolist():
-        probabilities += weights[place] @ (density / (density + real[:, place]))
+    for row in np.flatnonzero(weights.sum(axis=1) > NEGLIGIBLE).tolist():
+        probabilities += weights[row] @ (density / (density + real[:, row]))
     # a stronger finding is not more likely noise
     falling = np.argsort(-scores, kind="stable")
     probabilities[falling] = np.maximum.accumulate(probabilities[falling])

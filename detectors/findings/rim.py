@@ -103,6 +103,6 @@ def _layers(
         count = cv2.blur(inside, (BLOCK_PX, BLOCK_PX), borderType=cv2.BORDER_CONSTANT)
         sizes = np.abs((total / np.maximum(count, 1e-6))[inside > 0])
         if len(sizes) >= FEWEST:
-            most = CLIP_SIGMAS * sigma_of(sizes)
-            variances[number] = np.mean(np.minimum(sizes, most) ** 2) / CLIPPED
+            limit = CLIP_SIGMAS * sigma_of(sizes)
+            variances[number] = np.mean(np.minimum(sizes, limit) ** 2) / CLIPPED
     return variances

@@ -149,7 +149,7 @@ def reliefs(
                     drift_y = down * sights[k, 2]
                     x = root * du + skew * dv
                     y = down * dv
-                    seen = _seen(
+                    share = _seen(
                         shape,
                         cosine_turn * x + sine_turn * y,
                         cosine_turn * y - sine_turn * x,
@@ -160,7 +160,7 @@ def reliefs(
                         stretch,
                         edge,
                     )
-                    total += sights[k, 7] / cosine * seen
+                    total += sights[k, 7] / cosine * share
                 line[j + 1] = line[j] + total
             for j in range(last_column, fine_w):
                 line[j + 1] = line[j]

@@ -47,17 +47,17 @@ def places_apart(
 ) -> np.ndarray:
     """Return up to ``count`` places (n, 2), rows and columns, drawn from the pixels that are
     ``free`` (h, w) bool, no two nearer than ``apart_px``."""
-    left = free.astype(np.uint8)
-    places: list[tuple[int, int]] = []
-    while len(places) < count:
-        remaining = np.flatnonzero(left)
+    is_free = free.astype(np.uint8)
+    centres_px: list[tuple[int, int]] = []
+    while len(centres_px) < count:
+        remaining = np.flatnonzero(is_free)
         if not len(remaining):
             break
         pixel = int(remaining[stream.integers(len(remaining))])
         row, column = divmod(pixel, free.shape[1])
-        places.append((row, column))
-        cv2.circle(left, (column, row), int(np.ceil(apart_px)), 0, cv2.FILLED)
-    return np.array(places, dtype=np.int64).reshape(-1, 2)
+        centres_px.append((row, column))
+        cv2.circle(is_free, (column, row), int(np.ceil(apart_px)), 0, cv2.FILLED)
+    return np.array(centres_px, dtype=np.int64).reshape(-1, 2)
 
 
 def squares_px(reach_px: float) -> tuple[float, ...]:

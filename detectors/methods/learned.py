@@ -103,8 +103,8 @@ class LearnedDetector(MatchedDetector):
         strongest = np.maximum(strongest, 0.0)
         # below one deviation in proportion: the root is too steep at 0 to repeat
         score = np.where(strongest > 0.5, np.sqrt(2.0 * strongest), 2.0 * strongest)
-        signed = side * score * whitened.known
-        deviation_m = float(np.median(whitened.unit_m[whitened.known]))
+        signed = side * score * whitened.is_known
+        deviation_m = float(np.median(whitened.unit_m[whitened.is_known]))
         unit = (
             "the root of twice the logarithm of a network's likelihood ratio; the noise of a pixel"
             f" is {1e3 * deviation_m:.3g} mm"
@@ -141,6 +141,6 @@ def seen_by_network(values: np.ndarray, known: np.ndarray, sign: float) -> np.nd
 
 def _evidence(network: Network, whitened: Whitened, sign: float) -> np.ndarray:
     """Return ln(1 + L) (r, c) float32 for the residuals times a sign."""
-    pictures = seen_by_network(whitened.values, whitened.known, sign)
+    pictures = seen_by_network(whitened.values, whitened.is_known, sign)
     log_ratio = network.log_odds(pictures) - np.float32(network.prior_log_odds)
     return np.logaddexp(np.float32(0.0), log_ratio)

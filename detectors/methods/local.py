@@ -248,12 +248,12 @@ class LocalDetector:
         assert isinstance(evidence, LocalEvidence)
         pixels = above(evidence, thresholds[0])
         scores = evidence.score.reshape(-1)[pixels]
-        places = evidence.cell.reshape(-1)[pixels]
+        cell_of_pixel = evidence.cell.reshape(-1)[pixels]
         signed = evidence.signed
         # peaks join cells of their own sign only
-        if not (signed.reshape(-1)[places] > 0).any():
+        if not (signed.reshape(-1)[cell_of_pixel] > 0).any():
             signed = np.minimum(signed, 0.0)
-        peaks = _peak_of_cells(signed, thresholds[0])[places]
+        peaks = _peak_of_cells(signed, thresholds[0])[cell_of_pixel]
         # number the peaks that have pixels in the order of their heights
         _, labels = np.unique(peaks, return_inverse=True)
         strengths = np.zeros(int(labels.max(initial=-1)) + 1)
@@ -390,19 +390,19 @@ def _scored(
     share from 0 to 1, is excluded from the wider means of other pixels; a strong pixel is excluded
     from surroundings and noise. A sure pixel's score still grows with the width, if narrower means
     confirm it (`_strongest`)."""
-    seen = weights > 0
+    is_known = weights > 0
     # in units of a typical pixel's noise, so that single precision is enough
-    unit_m = max(sigma_of(residual_m[seen]), float(np.sqrt(sum(rounding_m2))), 1e-9)
+    unit_m = max(sigma_of(residual_m[is_known]), float(np.sqrt(sum(rounding_m2))), 1e-9)
     fixed = rounding_m2[0] / unit_m**2
     random = rounding_m2[1] / unit_m**2
-    count = _filter_count(seen)
+    count = _filter_count(is_known)
     values: np.ndarray = (residual_m / unit_m).astype(np.float32)
-    rest, sigma = _levelled(values, weights, HALF_WIDTHS[count + SURROUNDINGS - 1])
-    clipped = np.clip(rest, -CLIP_SIGMAS * sigma, CLIP_SIGMAS * sigma)
-    modest = np.clip(rest, -LEVEL_SIGMAS * sigma, LEVEL_SIGMAS * sigma)
-    rim = sigma**2 * _rim_variances(rest / sigma, seen, reach_px)
+    levelled, sigma = _levelled(values, weights, HALF_WIDTHS[count + SURROUNDINGS - 1])
+    clipped = np.clip(levelled, -CLIP_SIGMAS * sigma, CLIP_SIGMAS * sigma)
+    modest = np.clip(levelled, -LEVEL_SIGMAS * sigma, LEVEL_SIGMAS * sigma)
+    rim = sigma**2 * _rim_variances(levelled / sigma, is_known, reach_px)
 
-    best = np.zeros(seen.shape, np.float32)
+    best = np.zeros(is_known.shape, np.float32)
     sure = np.zeros_like(best)
     quiet = np.ones_like(best)
     typical_m = 0.0
@@ -421,11 +421,11 @@ def _scored(
             around, _ = _mean(modest, quiet * weights, wide)
             # scale differences to the noise of a whole window
             difference = (mean - around) * worth
-            sigma = local_sigma(np.where(seen & (quiet > 0), difference, np.nan), window, floor)
+            sigma = local_sigma(np.where(is_known & (quiet > 0), difference, np.nan), window, floor)
             sigma = np.hypot(sigma, worth * np.sqrt(rim_mean))
-            score = np.where(seen, difference / sigma, 0.0)
+            score = np.where(is_known, difference / sigma, 0.0)
             quiet = np.minimum(quiet, np.clip(STRONG - np.abs(score), 0.0, 1.0))
-        typical_m = typical_m or unit_m * float(np.median(sigma[seen]))
+        typical_m = typical_m or unit_m * float(np.median(sigma[is_known]))
         best = np.where((sure < 1.0) & (np.abs(score) > np.abs(best)), score, best)
         sure = np.maximum(sure, np.clip(np.abs(best) / STRONG - 1.0, 0.0, 1.0))
         # for sure pixels, the mean over all
@@ -453,8 +453,8 @@ def _rim_variances(noise: np.ndarray, seen: np.ndarray, reach_px: float) -> np.n
     quiet = inner & (cv2.dilate(loud, np.ones((5, 5), np.uint8)) == 0)
     values = np.where(seen, noise, 0.0).astype(np.float32)
     covariance = whitening.noise_covariance(values, quiet, whitening.grid_of(seen.shape))
-    by = whitening.filters(covariance, seen.shape)
-    variances = rim_variances(values, depth_px, by, reach_px, is_alone=True)
+    filters = whitening.filters(covariance, seen.shape)
+    variances = rim_variances(values, depth_px, filters, reach_px, is_alone=True)
     return on_pixels(variances, depth_px)
 
 
@@ -474,13 +474,13 @@ def _levelled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values (r, c) minus their level over the widest surroundings, and their local noise
     (r, c). Values count for the level only within `LEVEL_SIGMAS` of this noise."""
-    known = _tent(weights, widest) + FAINT
+    total_weight = _tent(weights, widest) + FAINT
     level = np.zeros_like(values)
     for _ in range(3):
-        rest = values - level
-        sigma = local_sigma(np.where(weights > 0, rest, np.nan), LEAST_WINDOW, 1e-3)
+        levelled = values - level
+        sigma = local_sigma(np.where(weights > 0, levelled, np.nan), LEAST_WINDOW, 1e-3)
         limit = LEVEL_SIGMAS * sigma
-        level = level + _tent(np.clip(rest, -limit, limit) * weights, widest) / known
+        level = level + _tent(np.clip(levelled, -limit, limit) * weights, widest) / total_weight
     return values - level, sigma
 
 
@@ -594,10 +594,10 @@ def local_sigma(
     rows = _nodes(height, half)
     columns = _nodes(width, half)
     nodes = _local_medians(values, rows, columns, half, max(1, half // samples)) / 0.6745
-    known = np.isfinite(nodes)
-    finite = nodes[known] if known.any() else np.abs(values[np.isfinite(values)]) / 0.6745
+    is_finite = np.isfinite(nodes)
+    finite = nodes[is_finite] if is_finite.any() else np.abs(values[np.isfinite(values)]) / 0.6745
     everywhere = median_of(finite) if len(finite) else floor
-    nodes = np.maximum(np.where(known, nodes, everywhere), floor).astype(np.float32)
+    nodes = np.maximum(np.where(is_finite, nodes, everywhere), floor).astype(np.float32)
     even = cv2.blur(nodes, (3, 3), borderType=cv2.BORDER_REPLICATE)
     return cv2.resize(even, (width, height), interpolation=cv2.INTER_LINEAR)
 

@@ -101,7 +101,7 @@ class Whitened(NamedTuple):
 
     values: np.ndarray
     """(r, c) float32: C^-1/2 r, in deviations; beside unknown pixels its noise differs from 1."""
-    known: np.ndarray
+    is_known: np.ndarray
     """(r, c) bool."""
     unit_m: np.ndarray
     """(r, c): deviation of the residuals nearby, metres."""
@@ -169,7 +169,7 @@ class MatchedDetector(LocalDetector):
             rim = _rim(residuals, covariance, reach_px, is_alone=True)
         tamed = _tamed(residuals.values) if self._clips else residuals.values
         signed, narrowest = _judged(residuals, tamed, covariance, rim)
-        depth_m = narrowest * float(np.median(residuals.unit_m[residuals.known]))
+        depth_m = narrowest * float(np.median(residuals.unit_m[residuals.is_known]))
         unit = (
             f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the"
             " narrowest"
@@ -187,10 +187,10 @@ class MatchedDetector(LocalDetector):
         covariance = self._covariance
         if covariance is None:
             covariance = _covariance(residuals)
-        known = residuals.known
-        filters = whitening.filters(covariance, known.shape)
-        solved = whitening.inverse_times(_tamed(residuals.values), known, filters)
-        return Whitened(whitening.root_times(solved, filters), known, residuals.unit_m)
+        is_known = residuals.is_known
+        filters = whitening.filters(covariance, is_known.shape)
+        solved = whitening.inverse_times(_tamed(residuals.values), is_known, filters)
+        return Whitened(whitening.root_times(solved, filters), is_known, residuals.unit_m)
 
     def calibrate(self, hole_free: Sequence[Cloud]) -> Mapping[str, np.ndarray]:
         """Return the mean covariance of the clouds' residuals by lag, in squared deviations of the
@@ -203,8 +203,8 @@ class MatchedDetector(LocalDetector):
         covariance = np.mean([_covariance(picture) for picture in residuals], axis=0)
         reach_px = max(picture.reach_px for picture in pictures)
         is_alone = len(residuals) == 1
-        rims = [_rim(one, covariance, reach_px, is_alone=is_alone) for one in residuals]
-        lone = sum(int((_tamed(one.values) != one.values).sum()) for one in residuals)
+        rims = [_rim(picture, covariance, reach_px, is_alone=is_alone) for picture in residuals]
+        lone = sum(int((_tamed(picture.values) != picture.values).sum()) for picture in residuals)
         return {"covariance": covariance, "rim": np.mean(rims, axis=0), "lone": np.array(lone)}
 
     def calibrated(self, learned: Mapping[str, np.ndarray]) -> MatchedDetector:
@@ -241,7 +241,7 @@ class _Residuals(NamedTuple):
     values: np.ndarray
     """(r, c) float32: residuals in units of the noise nearby, reduced where a point's own variance
     is larger, minus what they share along the outline."""
-    known: np.ndarray
+    is_known: np.ndarray
     """(r, c) bool."""
     depth_px: np.ndarray
     """(r, c): distance of each pixel from the outline of the known ones."""
@@ -256,25 +256,25 @@ def _in_deviations(
 ) -> _Residuals:
     """Return residuals (r, c) with weights (r, c), 0 where unknown, in units of the noise nearby,
     which is at least that of rounding."""
-    known = weights > 0
+    is_known = weights > 0
     floor_m = max(float(np.sqrt(sum(rounding_m2))), 1e-9)
-    values = np.where(known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
+    values = np.where(is_known, residual_m * np.sqrt(weights), 0.0).astype(np.float32)
     # structure wider than a filter's window, objects and the surface's misfit are not noise of
     # pixels
     side = (SHORT_PX, SHORT_PX)
     total = cv2.blur(values, side, borderType=cv2.BORDER_REFLECT)
-    count = cv2.blur(known.astype(np.float32), side, borderType=cv2.BORDER_REFLECT)
+    count = cv2.blur(is_known.astype(np.float32), side, borderType=cv2.BORDER_REFLECT)
     short = values - total / np.maximum(count, np.float32(1e-6))
-    short[~known] = np.nan
-    step = max(1, np.count_nonzero(known) // 65536)
-    short_size = median_of(np.abs(short[known][::step]))
-    size = median_of(np.abs(values[known][::step]))
+    short[~is_known] = np.nan
+    step = max(1, np.count_nonzero(is_known) // 65536)
+    short_size = median_of(np.abs(short[is_known][::step]))
+    size = median_of(np.abs(values[is_known][::step]))
     share = short_size / max(size, 1e-12)
     unit_m = np.maximum(local.local_sigma(short) / max(share, 1e-3), floor_m)
-    depth_px = outline_depth_px(known)
+    depth_px = outline_depth_px(is_known)
     return _Residuals(
-        _without_rim(values / unit_m, depth_px * known),
-        known,
+        _without_rim(values / unit_m, depth_px * is_known),
+        is_known,
         depth_px,
         unit_m,
     )
@@ -346,9 +346,9 @@ def _subtract_layers(
 
 def _covariance(residuals: _Residuals) -> np.ndarray:
     """Return the covariance of weak residuals, away from the rim unless most pixels lie there."""
-    inner = residuals.known
-    if _has_interior(residuals.depth_px * residuals.known):
-        inner = residuals.known & (residuals.depth_px > RIM_PX)
+    inner = residuals.is_known
+    if _has_interior(residuals.depth_px * residuals.is_known):
+        inner = residuals.is_known & (residuals.depth_px > RIM_PX)
     loud = (np.abs(residuals.values) > QUIET_SIGMAS).astype(np.uint8)
     quiet = inner & (cv2.dilate(loud, np.ones((5, 5), np.uint8)) == 0)
     grid = whitening.grid_of(residuals.values.shape)
@@ -365,7 +365,7 @@ def _rim(
     """Return the variances (n,) that the rim, into which edges reach by ``reach_px``, adds to noise
     of this covariance, by distance from the outline (`rim_variances`)."""
     noise = whitening.filters(covariance, residuals.values.shape)
-    depth_px = residuals.depth_px * residuals.known
+    depth_px = residuals.depth_px * residuals.is_known
     return rim_variances(residuals.values, depth_px, noise, reach_px, is_alone=is_alone)
 
 
@@ -409,23 +409,23 @@ def _judged(
     """Return signed scores (r, c) of residuals in deviations, and the deviation of the narrowest
     template's height. ``tamed`` (r, c): their values, clipped or not. ``rim`` (n,): variances that
     the rim adds to the covariance."""
-    known = residuals.known
+    is_known = residuals.is_known
     window_px = templates.window_of(covariance)
     power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
     noise = _Noise(
-        whitening.filters(covariance, known.shape),
+        whitening.filters(covariance, is_known.shape),
         BLOCK_PX * on_pixels(rim, residuals.depth_px),
         window_px,
         templates.worths(power, window_px),
         slots.energies(power, window_px),
     )
     radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
-    strong = _strong_findings(residuals.values, tamed, known, noise)
-    rest = known & ~grown(strong.core, MARGIN_PX)
-    second = _scored(tamed * rest, rest, noise, strong.discs, strong.solved)
+    strong = _strong_findings(residuals.values, tamed, is_known, noise)
+    quiet = is_known & ~grown(strong.core, MARGIN_PX)
+    second = _scored(tamed * quiet, quiet, noise, strong.discs, strong.solved)
     signed = second.signed
     _fill_discs(signed, radius_px[second.template])
-    signed *= known
+    signed *= is_known
     # only now are deviations known; among those of round templates, that of the narrowest is known
     # best
     is_slot = np.array([template.slot is not None for template in templates.bank(window_px)])
@@ -507,19 +507,19 @@ def _strong_findings(
     discs = np.zeros(known.shape, np.uint8)
     radius_px = np.array([template.radius_px for template in templates.bank(noise.window_px)])
     for _ in range(MOST_ROUNDS):
-        rest = known & ~grown(core, MARGIN_PX)
-        scores = _scored(tamed * rest, rest, noise)
-        found = _cores(scores.signed, radius_px[scores.template], values, rest)
-        for part in found:
+        quiet = known & ~grown(core, MARGIN_PX)
+        scores = _scored(tamed * quiet, quiet, noise)
+        cores = _cores(scores.signed, radius_px[scores.template], values, quiet)
+        for part in cores:
             core[part.cut] |= part.inside
             signed[part.cut][part.inside] = part.signed
             template[part.cut][part.inside] = scores.template[part.peak]
         size = np.abs(scores.signed)
         quiet_peaks = np.argwhere((size > STRONG) & _highest(size)).tolist()
-        for row, column in [part.peak for part in found] or quiet_peaks:
+        for row, column in [part.peak for part in cores] or quiet_peaks:
             radius = round(float(radius_px[scores.template[row, column]]))
             cv2.circle(discs, (column, row), radius, 1, cv2.FILLED)
-        if not found:
+        if not cores:
             break
     # where much is removed, the rough solution is a poor start
     solved = None if core.any() else scores.solved
@@ -562,9 +562,9 @@ def _cores(
         inside = (parts[cut] == number) & known[cut]
         heights = smooth[cut][inside].astype(np.float64)
         side = np.sign(heights[np.abs(heights).argmax()])
-        own = np.where(inside, side * signed[cut], 0.0)
-        row, column = np.unravel_index(own.argmax(), own.shape)
-        score = float(own[row, column])
+        side_scores = np.where(inside, side * signed[cut], 0.0)
+        row, column = np.unravel_index(side_scores.argmax(), side_scores.shape)
+        score = float(side_scores[row, column])
         peak = int(top + row), int(left + column)
         least = max(STRONG, OWN_SHARE * float(nearby[peak]))
         if score <= least or area <= LOUD_SHARE * np.pi * radius_px[peak] ** 2:
@@ -745,13 +745,13 @@ def _draw(best: _Best, slot: slots.BestSlot, number: int) -> None:
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     scores = np.full(len(along), local.SADDLE * 1.01 * slot.score, np.float32)
     scores[len(along) // 2] = slot.score
-    place = rows[inside], columns[inside]
+    on_grid = rows[inside], columns[inside]
     scores = scores[inside]
-    if np.abs(best.signed[place]).max(initial=0.0) > abs(slot.score):
+    if np.abs(best.signed[on_grid]).max(initial=0.0) > abs(slot.score):
         return
-    stronger = np.abs(scores) > np.abs(best.signed[place])
-    best.signed[place] = np.where(stronger, scores, best.signed[place])
-    best.template[place] = np.where(stronger, number, best.template[place])
+    stronger = np.abs(scores) > np.abs(best.signed[on_grid])
+    best.signed[on_grid] = np.where(stronger, scores, best.signed[on_grid])
+    best.template[on_grid] = np.where(stronger, number, best.template[on_grid])
 
 
 def _responses(
@@ -837,7 +837,7 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
     proportion below `FAINT`. Scores between pixels, ``down`` or ``right``, belong to all around.
     """
     scale = np.float32(per_deviation)
-    more = np.float32(raised)
+    raised_by = np.float32(raised)
     faint = np.float32(per_deviation * np.sqrt(1.0 + raised / FAINT**2))
     height, width = score.shape
     for y in range(down + 1):
@@ -847,7 +847,7 @@ def _keep_stronger(  # type: ignore[no-untyped-def]
                 kept = signed[i + y][x:]
                 kept_by = by[i + y][x:]
                 for j in range(width - x):
-                    size = min(abs(row[j]) * faint, np.sqrt((row[j] * scale) ** 2 + more))
+                    size = min(abs(row[j]) * faint, np.sqrt((row[j] * scale) ** 2 + raised_by))
                     stronger = size > abs(kept[j])
                     kept[j] = np.copysign(size, row[j]) if stronger else kept[j]
                     kept_by[j] = number if stronger else kept_by[j]

@@ -215,9 +215,9 @@ def _layers_of(
         outputs = 1 if is_last else len(bias)
         shape = (outputs, inputs, RINGS)
         if weights.shape != shape or bias.shape != (outputs,):
-            found = f"weights {weights.shape} and a bias {bias.shape}"
+            shapes = f"weights {weights.shape} and a bias {bias.shape}"
             legal = f"weights {shape} and a bias ({outputs},)"
-            raise UserError(f"{path}: layer {number} has {found}", legal=legal, fix=AGAIN)
+            raise UserError(f"{path}: layer {number} has {shapes}", legal=legal, fix=AGAIN)
         layer = Layer(weights.astype(np.float32), bias.astype(np.float32), dilation_px)
         if not (np.isfinite(layer.weights).all() and np.isfinite(layer.bias).all()):
             raise UserError(f"{path}: layer {number} has numbers that are not finite", fix=AGAIN)

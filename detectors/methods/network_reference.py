@@ -18,9 +18,9 @@ def convolved(pictures: np.ndarray, layer: Layer) -> np.ndarray:
                 for right in (-1, 0, 1):
                     seen_column = column + right * layer.dilation_px
                     if 0 <= seen_row < height and 0 <= seen_column < width:
-                        seen = pictures[:, seen_row, seen_column]
+                        inputs = pictures[:, seen_row, seen_column]
                         ring = abs(down) + abs(right)
                         share = 1.0 if ring == 0 else 0.5
-                        total = total + share * layer.weights[:, :, ring] @ seen
+                        total = total + share * layer.weights[:, :, ring] @ inputs
             outputs[:, row, column] = total
     return outputs

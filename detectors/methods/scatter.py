@@ -82,9 +82,9 @@ def evened(score: np.ndarray, template: Template, zones: Zones) -> float:
     step = 2 if template.coarse else 1
     loud = zones.loud
     if template.radius_px >= WIDE_PX and template.slot is None:
-        most = FAINT * scatter(score, zones, np.zeros_like(loud)).deviations[-1]
-        if cv2.norm(score, cv2.NORM_INF) > most:
-            loud = loud | (np.abs(score) > most)
+        limit = FAINT * scatter(score, zones, np.zeros_like(loud)).deviations[-1]
+        if cv2.norm(score, cv2.NORM_INF) > limit:
+            loud = loud | (np.abs(score) > limit)
         if loud.any():
             loud = grown(loud, round(template.radius_px / step))
     measured = scatter(score, zones, loud)
@@ -149,7 +149,7 @@ def scatter(score: np.ndarray, zones: Zones, loud: np.ndarray) -> Scatter:
 def _by_square(score: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Return the sums (a, b) of sizes in squares, their numbers (a, b), and both over all."""
     h, w = score.shape
-    most = np.float32(CAP)
+    cap = np.float32(CAP)
     rows = max(1, h // PART_PX)
     columns = max(1, w // PART_PX)
     sums = np.zeros((rows, columns))
@@ -164,7 +164,7 @@ def _by_square(score: np.ndarray, loud: np.ndarray) -> tuple[np.ndarray, np.ndar
             hidden = loud[i]
             for j in range(w):
                 value = np.float32(0.0) if hidden[j] else values[j]
-                sizes[j] += min(abs(value), most)
+                sizes[j] += min(abs(value), cap)
                 numbers[j] += value != 0
         for column in range(columns):
             for j in range(column * w // columns, (column + 1) * w // columns):
@@ -186,7 +186,7 @@ def _by_zone(  # type: ignore[no-untyped-def]
 ):
     """Return the deviation (z,) of each zone. The last zone holds what is left of the ``total``
     and the ``number``, or all if that is too little."""
-    most = np.float32(CAP)
+    cap = np.float32(CAP)
     last = N_ZONES - 1
     sums = np.zeros(N_ZONES)
     counts = np.zeros(N_ZONES)
@@ -199,7 +199,7 @@ def _by_zone(  # type: ignore[no-untyped-def]
         count = 0
         for k in range(start, ends[zone]):
             value = np.float32(0.0) if hidden[pixels[k]] else flat[pixels[k]]
-            size += min(abs(value), most)
+            size += min(abs(value), cap)
             count += value != 0
         sums[zone] = size
         counts[zone] = count

@@ -147,9 +147,9 @@ def peaks_of(signed: np.ndarray) -> np.ndarray:
     size = np.abs(signed)
     side = 2 * APART_PX + 1
     highest = (size > LEAST) & (size >= cv2.dilate(size, np.ones((side, side), np.uint8)))
-    places = np.argwhere(highest)
-    order = np.argsort(-size[tuple(places.T)], kind="stable")
-    return places[order[:MOST_PEAKS]]
+    peaks = np.argwhere(highest)
+    order = np.argsort(-size[tuple(peaks.T)], kind="stable")
+    return peaks[order[:MOST_PEAKS]]
 
 
 def lowered(signed: np.ndarray) -> np.ndarray:

@@ -213,11 +213,11 @@ def _columns_of(path: Path, header: Header) -> dict[str, np.ndarray]:
     the file. Raises any exception if the data are damaged."""
     points = header.width * header.height
     singles = {
-        name.lower(): place for place, (name, _, count) in enumerate(header.fields) if count == 1
+        name.lower(): number for number, (name, _, count) in enumerate(header.fields) if count == 1
     }
     # names may occur twice, such as PCD's "_" for padding
     layout = np.dtype(
-        [(f"{place}", kind, (count,)) for place, (_, kind, count) in enumerate(header.fields)]
+        [(f"{number}", kind, (count,)) for number, (_, kind, count) in enumerate(header.fields)]
     )
     with path.open("rb") as file:
         file.seek(header.begin)
@@ -227,23 +227,23 @@ def _columns_of(path: Path, header: Header) -> dict[str, np.ndarray]:
             if text.shape[1] != header.text_columns:
                 raise ValueError(f"{text.shape[1]} numbers in a line, {header.text_columns} stated")
             return {
-                name: text[:, starts[place]].astype(header.fields[place][1])
-                for name, place in singles.items()
+                name: text[:, starts[number]].astype(header.fields[number][1])
+                for name, number in singles.items()
             }
         if header.form == "binary":
             rows = np.frombuffer(file.read(points * layout.itemsize), layout)
             return {
-                name: np.ascontiguousarray(rows[f"{place}"][:, 0])
-                for name, place in singles.items()
+                name: np.ascontiguousarray(rows[f"{number}"][:, 0])
+                for name, number in singles.items()
             }
         packed_bytes, unpacked_bytes = struct.unpack("<II", file.read(8))
         unpacked = unpack(file.read(packed_bytes), unpacked_bytes)
     columns = {}
     start = 0
-    for place, (name, kind, count) in enumerate(header.fields):
+    for number, (name, kind, count) in enumerate(header.fields):
         column = np.frombuffer(unpacked, kind, points * count, start)
         start += column.nbytes
-        if singles.get(name.lower()) == place:
+        if singles.get(name.lower()) == number:
             columns[name.lower()] = column
     return columns
 

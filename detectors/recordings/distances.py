@@ -146,8 +146,8 @@ def _is_beyond(stored: np.ndarray, scale_m: float) -> np.ndarray:
         is_large = (points > LARGEST_M / scale_m).any(axis=-1)
         is_aside = across > SIDEMOST * points[..., 2]
     # where most are aside, the cloud is in another frame, which `refuse_far_aside` says
-    seen = is_aside[np.isfinite(across) & (points[..., 2] > 0)]
-    is_other_frame = seen.size > 0 and seen.mean() > 0.5
+    judged = is_aside[np.isfinite(across) & (points[..., 2] > 0)]
+    is_other_frame = judged.size > 0 and judged.mean() > 0.5
     return np.asarray(is_large if is_other_frame else is_large | is_aside)
 
 

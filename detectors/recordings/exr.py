@@ -69,18 +69,18 @@ def _header(content: bytearray) -> tuple[list[Channel], tuple[int, int]]:
         raise ValueError("it has several parts or deep pixels")
     channels: list[Channel] = []
     size = (0, 0)
-    place = HEADER_FROM
-    while content[place]:
-        name, place = _text(content, place)
-        _, place = _text(content, place)
-        (length,) = struct.unpack_from("<I", content, place)
-        place += 4
+    offset = HEADER_FROM
+    while content[offset]:
+        name, offset = _text(content, offset)
+        _, offset = _text(content, offset)
+        (length,) = struct.unpack_from("<I", content, offset)
+        offset += 4
         if name == b"channels":
-            channels = _channels(content, place)
+            channels = _channels(content, offset)
         if name in (b"dataWindow", b"displayWindow"):
-            left, top, right, bottom = struct.unpack_from("<4i", content, place)
+            left, top, right, bottom = struct.unpack_from("<4i", content, offset)
             size = (max(size[0], right - left + 1), max(size[1], bottom - top + 1))
-        place += length
+        offset += length
     return channels, size
 
 
@@ -91,15 +91,15 @@ def _text(content: bytearray, start: int) -> tuple[bytes, int]:
     return bytes(content[start:end]), end + 1
 
 
-def _channels(content: bytearray, place: int) -> list[Channel]:
+def _channels(content: bytearray, offset: int) -> list[Channel]:
     """Return the channels of a list that begins at a place. Raises as `_header` does."""
     channels = []
-    while content[place]:
-        start = place
-        name, place = _text(content, start)
-        (kind,) = struct.unpack_from("<i", content, place)
+    while content[offset]:
+        start = offset
+        name, offset = _text(content, start)
+        (kind,) = struct.unpack_from("<i", content, offset)
         channels.append(Channel(name, start, kind))
-        place += CHANNEL_BYTES
+        offset += CHANNEL_BYTES
     return channels
 
 

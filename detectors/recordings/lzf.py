@@ -21,30 +21,30 @@ def unpack(packed: bytes, size: int) -> bytes:
 def _unpack(packed: np.ndarray, unpacked: np.ndarray) -> int:
     """Fill ``unpacked`` and return the number of bytes, -1 if they do not fit or the input ends
     within an instruction."""
-    at = 0
+    position = 0
     done = 0
-    while at < len(packed):
-        control = int(packed[at])
-        at += 1
+    while position < len(packed):
+        control = int(packed[position])
+        position += 1
         if control < LITERALS:
             length = control + 1
-            if at + length > len(packed) or done + length > len(unpacked):
+            if position + length > len(packed) or done + length > len(unpacked):
                 return -1
             for i in range(length):
-                unpacked[done + i] = packed[at + i]
-            at += length
+                unpacked[done + i] = packed[position + i]
+            position += length
             done += length
             continue
         length = control >> 5
         if length == LONG:
-            if at >= len(packed):
+            if position >= len(packed):
                 return -1
-            length += int(packed[at])
-            at += 1
-        if at >= len(packed):
+            length += int(packed[position])
+            position += 1
+        if position >= len(packed):
             return -1
-        begin = done - ((control & 31) << 8) - int(packed[at]) - 1
-        at += 1
+        begin = done - ((control & 31) << 8) - int(packed[position]) - 1
+        position += 1
         length += SHORTEST
         if begin < 0 or done + length > len(unpacked):
             return -1

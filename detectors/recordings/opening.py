@@ -245,8 +245,8 @@ def _no_capture(folder: Path, inside: Sequence[Path]) -> UserError:
     problem = f"{folder}: is empty"
     if inside:
         names = ", ".join(path.name for path in inside[:HELD])
-        more = ", .." if len(inside) > HELD else ""
-        problem = f"{folder}: contains no capture; it holds {names}{more}"
+        ellipsis = ", .." if len(inside) > HELD else ""
+        problem = f"{folder}: contains no capture; it holds {names}{ellipsis}"
     captures = [str(path) for path in inside if _may_be_capture(path)]
     fix = None
     if captures:

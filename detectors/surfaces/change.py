@@ -73,16 +73,16 @@ def distances(
         variances_m2.append(variance_m2 * np.minimum(share, count) / np.maximum(count, 1))
     distance_m = means_m[1] - means_m[0]
     noise_m = np.sqrt(variances_m2[0] + variances_m2[1])
-    known = np.isfinite(distance_m)
+    is_known = np.isfinite(distance_m)
     common_m2 = 0.0
-    if known.any():
-        scatter_m = sigma_of(distance_m[known] - median_of(distance_m[known]))
-        explained_m2 = noise_m[known] ** 2 + registration_m[known] ** 2
+    if is_known.any():
+        scatter_m = sigma_of(distance_m[is_known] - median_of(distance_m[is_known]))
+        explained_m2 = noise_m[is_known] ** 2 + registration_m[is_known] ** 2
         common_m2 = max(scatter_m**2 - median_of(explained_m2), 0.0)
     return Distances(
         distance_m=distance_m,
         noise_m=noise_m,
-        registration_m=np.where(known, registration_m, np.nan),
+        registration_m=np.where(is_known, registration_m, np.nan),
         common_m=float(np.sqrt(common_m2)),
     )
 
@@ -100,8 +100,8 @@ def _along(
     means_m = np.full(len(cores_m), np.nan)
     variances_m2 = np.full(len(cores_m), np.nan)
     counts = np.zeros(len(cores_m))
-    near = tree.query_ball_point(cores_m, np.hypot(radius_m, reach_m))
-    for number, members in enumerate(near):
+    neighbours = tree.query_ball_point(cores_m, np.hypot(radius_m, reach_m))
+    for number, members in enumerate(neighbours):
         arms = points_m[members] - cores_m[number]
         along = arms @ normals[number]
         across = arms - along[:, None] * normals[number]

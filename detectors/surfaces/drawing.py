@@ -110,9 +110,9 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
 
 def _placed(front: Triangles, sample: np.ndarray) -> Pose:
     """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
-    few = sample[:: max(1, len(sample) // FEW)]
+    thinned = sample[:: max(1, len(sample) // FEW)]
     starts = [_start(front, sample, turn) for turn in range(ROLLS)]
-    tried = [fitted(front, few, start) for start in starts]
+    tried = [fitted(front, thinned, start) for start in starts]
     return fitted(front, sample, starts[tried.index(closest_of(tried))])
 
 

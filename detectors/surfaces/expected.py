@@ -190,8 +190,8 @@ def fitted(
     for step in range(3 * STEPS if known else 0, 4 * STEPS):
         by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)
-        triangle, places = closest_places(triangles.tree, moved)
-        offsets = moved - places
+        triangle, feet = closest_places(triangles.tree, moved)
+        offsets = moved - feet
         towards = triangles.normals[triangle]
         if by_planes:
             off = np.einsum("ni,ni->n", offsets, towards)
@@ -361,16 +361,16 @@ def refined(
                 moved, _ = met(triangles, moved_by(motion, middle) @ T, rays, central)
                 ends.append(moved)
             slopes[:, axis] = (ends[0] - ends[1]) / (2.0 * step)
-        seen = np.isfinite(off) & np.isfinite(slopes).all(axis=1)
-        off = off[seen]
-        slopes = slopes[seen]
+        is_met = np.isfinite(off) & np.isfinite(slopes).all(axis=1)
+        off = off[is_met]
+        slopes = slopes[is_met]
         scale_m = max(float(np.median(np.abs(off))) / 0.6745, LEAST_SCALE_M)
         weight = bisquare_weights(off, BISQUARE_TUNING * scale_m)
         spread_m2 = share_px * scale_m**2
         weighted = (slopes * weight[:, None]).T / spread_m2
         by_noise = _noise_information(
-            displacement_jacobian(arms[seen], np.zeros(3)),
-            weight * variances_m2[seen] / (2.0 * pitch_m**2 * spread_m2),
+            displacement_jacobian(arms[is_met], np.zeros(3)),
+            weight * variances_m2[is_met] / (2.0 * pitch_m**2 * spread_m2),
             _normal_of(arms),
         )
         information = start.information_about(middle)
@@ -434,12 +434,12 @@ def met(
 def another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndarray) -> str:
     """Return why points (n, 3) that lie ``off_m`` (n,) off a reference are another part's; empty
     if they need not be."""
-    seen = np.isfinite(off_m)
-    x, y, z = points_m[seen].T
+    is_met = np.isfinite(off_m)
+    x, y, z = points_m[is_met].T
     smooth = fit_surface(x, y, z, SurfaceConfig(method="bisquare"))
-    off_reference_m = float(np.quantile(np.abs(off_m[seen]), MOST))
+    off_reference_m = float(np.quantile(np.abs(off_m[is_met]), MOST))
     off_smooth_m = float(np.quantile(np.abs(z - smooth.evaluate(x, y)), MOST))
-    noise_m = float(np.sqrt(median_of(variances_m2[seen])))
+    noise_m = float(np.sqrt(median_of(variances_m2[is_met])))
     if off_reference_m < max(WORSE * off_smooth_m, BEYOND_NOISE * noise_m, APART_M):
         return ""
     return (

@@ -208,9 +208,9 @@ class Profile:
 
 def _filled(curve: np.ndarray) -> np.ndarray:
     """Return a curve (k,) with unknown knots interpolated."""
-    known = np.isfinite(curve)
+    is_finite = np.isfinite(curve)
     knots = np.arange(len(curve))
-    return np.interp(knots, knots[known], curve[known])
+    return np.interp(knots, knots[is_finite], curve[is_finite])
 
 
 def _bends(curve: np.ndarray, knots: int) -> np.ndarray:
@@ -276,8 +276,8 @@ def _explained(
     clipped = clipped - clipped.mean()
     explained = np.zeros(len(turns))
     for number, turn in enumerate(turns):
-        place = across * math.cos(turn) + along * math.sin(turn)
-        strips = ((place - place.min()) / width).astype(np.int64)
+        position = across * math.cos(turn) + along * math.sin(turn)
+        strips = ((position - position.min()) / width).astype(np.int64)
         counts = np.bincount(strips)
         sums = np.bincount(strips, clipped)
         explained[number] = float((sums**2 / np.maximum(counts, 1)).sum())
@@ -358,8 +358,8 @@ def _refined(
 
     simplex = np.array([[0.0, 0.0], [5e-4, 0.0], [0.0, 5e-3]])
     options = {"initial_simplex": simplex, "xatol": 5e-5, "fatol": 1e-3 * limit, "maxfev": 30}
-    found = minimize(remaining, np.zeros(2), method="Nelder-Mead", options=options)
-    return of(found.x)
+    optimum = minimize(remaining, np.zeros(2), method="Nelder-Mead", options=options)
+    return of(optimum.x)
 
 
 def with_twist(profile: Profile, points: np.ndarray) -> Profile:
@@ -382,8 +382,8 @@ def with_twist(profile: Profile, points: np.ndarray) -> Profile:
     simplex = np.zeros((4, 3))
     simplex[1:] = np.diag(TWIST_STEPS)
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-3 * limit, "maxfev": 100}
-    found = minimize(remaining, np.zeros(3), method="Nelder-Mead", options=options)
-    turned = _turned(profile, found.x)
+    optimum = minimize(remaining, np.zeros(3), method="Nelder-Mead", options=options)
+    turned = _turned(profile, optimum.x)
     return _twisted(turned, picked(points, SEARCHED), rounds=3).fitted(points)
 
 

@@ -60,10 +60,10 @@ def extruded_faces(
 
 def _pitch(points_m: np.ndarray, central: bool) -> float:
     """Return the distance of neighbouring pixels in x/z, or in metres with parallel rays."""
-    places = points_m[..., 0]
+    positions = points_m[..., 0]
     if central:
-        places = places / points_m[..., 2]
-    steps = np.abs(np.diff(places[::4], axis=1))
+        positions = positions / points_m[..., 2]
+    steps = np.abs(np.diff(positions[::4], axis=1))
     return float(np.median(steps[np.isfinite(steps)]))
 
 
@@ -82,12 +82,12 @@ def _held(profile: Profile, points: np.ndarray, near: np.ndarray) -> bool:
 
 def turns_back(profile: Profile, crease_deg: float) -> bool:
     """Return whether the profile turns by the angle of a crease, and later back by as much."""
-    place = profile.first + profile.step * np.arange(len(profile.curve))
+    position = profile.first + profile.step * np.arange(len(profile.curve))
     ahead = profile.curve
     if profile.central:
         ahead = 1.0 / profile.curve
-        place = place * ahead
-    across_m = place[CHORD_KNOTS:] - place[:-CHORD_KNOTS]
+        position = position * ahead
+    across_m = position[CHORD_KNOTS:] - position[:-CHORD_KNOTS]
     ahead_m = ahead[CHORD_KNOTS:] - ahead[:-CHORD_KNOTS]
     angle = np.unwrap(np.arctan2(ahead_m, across_m))
     # the largest turn from a direction before a place, and the largest turn back behind it

@@ -52,8 +52,8 @@ def joined_pieces(
             for number in list(free):
                 if not _holds(fit, cosine, samples[number], apart_m):
                     continue
-                whole = np.logical_or.reduce([masks[member] for member in group])
-                if not _background_between(whole, masks[number], points_m[..., 2], apart_m):
+                joined_mask = np.logical_or.reduce([masks[member] for member in group])
+                if not _background_between(joined_mask, masks[number], points_m[..., 2], apart_m):
                     group.append(number)
                     free.remove(number)
                     joined = True
@@ -102,12 +102,12 @@ def _background_between(
     share = (np.arange(PLACES) + 0.5)[:, None] / PLACES
     rows = starts // width + share * (ends // width - starts // width)
     columns = starts % width + share * (ends % width - starts % width)
-    places = np.rint(rows).astype(int) * width + np.rint(columns).astype(int)
+    line_px = np.rint(rows).astype(int) * width + np.rint(columns).astype(int)
     flat = z_m.reshape(-1)
     # along a line of a picture of a plane, 1 / z is linear
-    near = 1.0 / flat[starts]
-    line_m = 1.0 / (near + share * (1.0 / flat[ends] - near))
-    behind = flat[places] > line_m + apart_m
+    start_inverse = 1.0 / flat[starts]
+    line_m = 1.0 / (start_inverse + share * (1.0 / flat[ends] - start_inverse))
+    behind = flat[line_px] > line_m + apart_m
     return bool(behind.any(axis=0).mean() >= BEHIND)
 
 

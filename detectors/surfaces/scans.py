@@ -92,9 +92,9 @@ def noise_m2_of(cloud: Cloud, mask: np.ndarray) -> np.ndarray:
     # neighbours in the view share a plane through the five nearest
     plan = _plan(points, cloud.projection == "central")
     sample = np.arange(0, len(points), max(1, len(points) // 5000))
-    _, near = cKDTree(plan).query(plan[sample], k=min(7, len(points)))
-    bends_m = points[sample, 2] - points[near[:, 1:], 2].mean(axis=1)
-    noise_m2 = sigma_of(bends_m) ** 2 / (1.0 + 1.0 / (near.shape[1] - 1))
+    _, neighbours = cKDTree(plan).query(plan[sample], k=min(7, len(points)))
+    bends_m = points[sample, 2] - points[neighbours[:, 1:], 2].mean(axis=1)
+    noise_m2 = sigma_of(bends_m) ** 2 / (1.0 + 1.0 / (neighbours.shape[1] - 1))
     return np.full(len(points), max(noise_m2, floor_m2))
 
 
@@ -190,8 +190,8 @@ def _towards_viewer(
     rays = corners.mean(axis=1) if central else np.array([[0.0, 0.0, 1.0]])
     away = (normals * rays).sum(axis=1) > 0
     normals[away] *= -1.0
-    known = np.isfinite(normals).all(axis=1)
-    return Triangles(corners, normals, variances_m2[faces]).chosen(known)
+    has_normal = np.isfinite(normals).all(axis=1)
+    return Triangles(corners, normals, variances_m2[faces]).chosen(has_normal)
 
 
 # ---------------------------------------------------------------- where it lies
@@ -207,10 +207,10 @@ def placed(
     if known is not None:
         best = fitted(scan.coarse, sample, known.T_part_camera, known, share_px=shared)
     else:
-        first, *others = _starts(scan.points_m, points_m)
+        first, *later_starts = _starts(scan.points_m, points_m)
         best = fitted(scan.coarse, sample, first, share_px=shared)
         is_near = best.apart_m < SAME_PLACE_PX * scan.pitch_m
-        for start in [] if is_near else others:
+        for start in [] if is_near else later_starts:
             pose = fitted(scan.coarse, sample, start, share_px=shared)
             if pose.apart_m < BETTER * best.apart_m:
                 best = pose
@@ -318,9 +318,9 @@ def laid_under(
 
 def _text(scan: PartScan, pose: Pose, median_off_m: float, by_marks: bool) -> str:
     """Return what the reference is and how well it fits, in words."""
-    how = "by marks and surface" if by_marks else "by outline and surface"
+    method = "by marks and surface" if by_marks else "by outline and surface"
     return (
-        f"{scan.name}, placed {how}, with half of the points within {median_off_m / MM:.2g} mm"
+        f"{scan.name}, placed {method}, with half of the points within {median_off_m / MM:.2g} mm"
         f" of it; {pose.error_m / MM:.2g} mm along its normals (standard error)"
     )
 
@@ -370,13 +370,13 @@ class GoodParts:
         kept = np.arange(len(self.heights_m)) != left_out
         heights_m = self.heights_m[kept]
         count = np.isfinite(heights_m).sum(axis=0)
-        seen = count >= max(1, len(heights_m) // 2)
-        heights_m = heights_m[:, seen]
-        count = count[seen]
+        is_measured = count >= max(1, len(heights_m) // 2)
+        heights_m = heights_m[:, is_measured]
+        count = count[is_measured]
         mean_m = np.nanmean(heights_m, axis=0)
         squares_m2 = np.nansum((heights_m - mean_m) ** 2, axis=0)
-        noise_m2 = np.nanmean(self.noises_m2[kept][:, seen], axis=0)
-        points_m = self.first.points_m[seen]
+        noise_m2 = np.nanmean(self.noises_m2[kept][:, is_measured], axis=0)
+        points_m = self.first.points_m[is_measured]
         scatter_m2 = noise_m2
         if len(heights_m) > 1:
             scatter_m2 = _scatter(_plan(points_m, self.central), squares_m2, count - 1.0)
@@ -402,8 +402,8 @@ def good_parts(
     rays = _plan(first.points_m, central)
     heights_m = [first.points_m[:, 2]]
     noises_m2 = [first.noise_m2]
-    for scan, known in others:
-        pose = placed(scan, first.points_m, first.share_px, central, known)
+    for scan, known_pose in others:
+        pose = placed(scan, first.points_m, first.share_px, central, known_pose)
         z_m, noise_m2 = met(scan.triangles, pose.T_part_camera, rays, central)
         off_m = first.points_m[:, 2] - z_m
         overlap = float(np.isfinite(off_m).mean())
@@ -433,7 +433,7 @@ def _scatter(rays: np.ndarray, squares_m2: np.ndarray, freedom: np.ndarray) -> n
     side = (SCATTER_PX, SCATTER_PX)
     border = cv2.BORDER_CONSTANT
     # sums over the window of one place's squares and degrees of freedom
-    near = cv2.blur(sums, side, borderType=border)[tuple(cells.T)]
+    window_m2 = cv2.blur(sums, side, borderType=border)[tuple(cells.T)]
     near_freedom = cv2.blur(counts, side, borderType=border)[tuple(cells.T)]
     typical_m2 = squares_m2.sum() / max(freedom.sum(), 1.0)
-    return np.asarray((near + PRIOR_PARTS * typical_m2) / (near_freedom + PRIOR_PARTS))
+    return np.asarray((window_m2 + PRIOR_PARTS * typical_m2) / (near_freedom + PRIOR_PARTS))

@@ -64,7 +64,7 @@ class Surfaces:
     """The smooth surfaces of a cloud, largest core first."""
 
     # each surface's pixels (n, h, w) bool
-    own: np.ndarray
+    masks: np.ndarray
     # the same with all that they enclose (n, h, w) bool
     filled: np.ndarray
     # smaller steps between surfaces do not count, metres

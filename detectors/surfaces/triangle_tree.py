@@ -123,18 +123,18 @@ def _first_hits(
                         shares[i, 1] = u
                         shares[i, 2] = v
                 continue
-            near = 2 * node
-            far = near + 1
-            near_entry = _entry(lows[near], highs[near], origin, reciprocal)
+            near_node = 2 * node
+            far = near_node + 1
+            near_entry = _entry(lows[near_node], highs[near_node], origin, reciprocal)
             far_entry = _entry(lows[far], highs[far], origin, reciprocal)
             if far_entry < near_entry:
-                near, far = far, near
+                near_node, far = far, near_node
                 near_entry, far_entry = far_entry, near_entry
             if far_entry < np.inf and far_entry <= nearest:
                 waiting[size] = far
                 size += 1
             if near_entry < np.inf and near_entry <= nearest:
-                waiting[size] = near
+                waiting[size] = near_node
                 size += 1
     return first, shares
 
@@ -196,7 +196,7 @@ def _closest_places(
     points: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     closest = np.full(len(points), -1, np.int64)
-    places = np.zeros((len(points), 3))
+    feet = np.zeros((len(points), 3))
     leaves = len(lows) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
     for i in range(len(points)):
@@ -204,7 +204,7 @@ def _closest_places(
         nearest = np.inf
         if i > 0:
             # the place closest to the point before it bounds the search, but may not be the first
-            nearest = (1.0 + 1e-12) * _square_off(places[i - 1], places[i - 1], point)
+            nearest = (1.0 + 1e-12) * _square_off(feet[i - 1], feet[i - 1], point)
         waiting[0] = 1
         size = 1
         while size > 0:
@@ -221,20 +221,20 @@ def _closest_places(
                     if square < nearest or is_first:
                         nearest = square
                         closest[i] = numbers[j]
-                        places[i, 0] = x
-                        places[i, 1] = y
-                        places[i, 2] = z
+                        feet[i, 0] = x
+                        feet[i, 1] = y
+                        feet[i, 2] = z
                 continue
-            near = 2 * node
-            far = near + 1
-            near_square = _square_off(lows[near], highs[near], point)
+            near_node = 2 * node
+            far = near_node + 1
+            near_square = _square_off(lows[near_node], highs[near_node], point)
             far_square = _square_off(lows[far], highs[far], point)
             if far_square < near_square:
-                near, far = far, near
+                near_node, far = far, near_node
             waiting[size] = far
-            waiting[size + 1] = near
+            waiting[size + 1] = near_node
             size += 2
-    return closest, places
+    return closest, feet
 
 
 @numba.njit(inline="always", **PLAIN)

@@ -98,7 +98,7 @@ def _by_order(highest: np.ndarray, area_m2: float, value: float, above: int) -> 
 class ScoreTail:
     """The mean number of findings of a board above a score, a tail of the scores' squares."""
 
-    place: float
+    location: float
     """Square of the score above which one finding is expected."""
     log_scale: float
     """Logarithm of the scale."""
@@ -109,15 +109,15 @@ class ScoreTail:
 
     @property
     def parameters(self) -> np.ndarray:
-        """Place, logarithm of the scale, shape."""
-        return np.array([self.place, self.log_scale, self.shape])
+        """Location, logarithm of the scale, shape."""
+        return np.array([self.location, self.log_scale, self.shape])
 
     def score_at(self, count: float) -> float:
         """Return the score above which so many findings of a board are expected."""
         scale = np.exp(self.log_scale)
-        square = self.place - scale * np.log(count)
+        square = self.location - scale * np.log(count)
         if abs(self.shape) >= FLAT:
-            square = self.place + scale * np.expm1(-self.shape * np.log(count)) / self.shape
+            square = self.location + scale * np.expm1(-self.shape * np.log(count)) / self.shape
         return float(np.sqrt(max(square, 0.0)))
 
     def log_count(self, score: float) -> float:
@@ -127,7 +127,7 @@ class ScoreTail:
     def hazard(self, score: float) -> float:
         """Return the slope by which that logarithm falls with the score."""
         scale = np.exp(self.log_scale)
-        return float(2 * score / (scale + self.shape * (score**2 - self.place)))
+        return float(2 * score / (scale + self.shape * (score**2 - self.location)))
 
     def error_of_log_count(self, score: float) -> float:
         """Return the standard error of that logarithm, by the delta method."""
@@ -177,15 +177,15 @@ def fitted_tail(peaks: Sequence[Sequence[float]]) -> ScoreTail | None:
     below = np.exp(-np.exp(_log_counts(end.x, highest)))
     if stats.kstest(below, "uniform").pvalue < LEVEL:
         return None
-    place, log_scale, shape = end.x.tolist()
-    return ScoreTail(place, log_scale, shape, covariance)
+    location, log_scale, shape = end.x.tolist()
+    return ScoreTail(location, log_scale, shape, covariance)
 
 
 def _log_counts(parameters: np.ndarray, square: np.ndarray) -> np.ndarray:
     """Return the logarithm of the mean number of findings above scores with these squares; -inf
     beyond the end."""
-    place, log_scale, shape = parameters
-    z = (square - place) / np.exp(log_scale)
+    location, log_scale, shape = parameters
+    z = (square - location) / np.exp(log_scale)
     if abs(shape) < FLAT:
         return np.asarray(-z)
     with np.errstate(invalid="ignore", divide="ignore"):

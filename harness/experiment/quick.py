@@ -122,6 +122,6 @@ def _thinned(axes: Axes, most: int) -> Axes:
         lengths[longest] -= 1
     thinned = {}
     for path, values in axes.items():
-        places = np.linspace(0, len(values) - 1, lengths[path]).round().astype(int)
-        thinned[path] = [values[place] for place in places]
+        indices = np.linspace(0, len(values) - 1, lengths[path]).round().astype(int)
+        thinned[path] = [values[index] for index in indices]
     return thinned

@@ -600,11 +600,11 @@ def _points(
                 )
             ]
     for draft in drafts:
-        config, found = _resolved(draft, source, True)
-        problems += found
+        config, own_problems = _resolved(draft, source, True)
+        problems += own_problems
         if len(problems) >= MAX_SHOWN:
             break
-        if config is None or found:
+        if config is None or own_problems:
             continue
         study = experiment.sensitivity
         calibrate = config.threshold.calibrate

@@ -90,8 +90,8 @@ class Changes:
     def lod_mm(self) -> float:
         """The level of detection at a typical point; NaN if none was measured."""
         lods_m = self.distances.lod_m[: len(self.cores_m)]
-        known = lods_m[np.isfinite(lods_m)]
-        return median_of(known) / MM if len(known) else math.nan
+        finite_m = lods_m[np.isfinite(lods_m)]
+        return median_of(finite_m) / MM if len(finite_m) else math.nan
 
     @property
     def counts(self) -> dict[str, int]:
@@ -102,9 +102,9 @@ class Changes:
     def sentence(self) -> str:
         """Return ``1 new, 2 grown``, with the level of detection."""
         counts = [f"{count} {state}" for state, count in self.counts.items() if count]
-        found = ", ".join(counts) or "no damage is new, grown, shrunk or gone"
+        states = ", ".join(counts) or "no damage is new, grown, shrunk or gone"
         typical = f"{self.lod_mm:.2g} mm at a typical place (95 %)"
-        return f"{found}; changes over {2 * self.radius_m / MM:.2g} mm are detected from {typical}"
+        return f"{states}; changes over {2 * self.radius_m / MM:.2g} mm are detected from {typical}"
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -127,10 +127,10 @@ class Changes:
         lods_m = self.distances.lod_m[:count]
         significant = self.distances.is_significant[:count]
         for number in np.flatnonzero(np.isfinite(lods_m)):
-            place = [f"{value:.2f}" for value in self.cores_m[number] / MM]
+            position = [f"{value:.2f}" for value in self.cores_m[number] / MM]
             sizes_m = (self.distances.distance_m[number], lods_m[number])
             sizes = [f"{value / MM:.4f}" for value in sizes_m]
-            writer.writerow((*place, *sizes, int(significant[number])))
+            writer.writerow((*position, *sizes, int(significant[number])))
         return stream.getvalue()
 
 
@@ -148,8 +148,8 @@ def changes_of(result: Judged, earlier: PartScan, then: Judged, now: Judged) -> 
     centres_m = _centres(result)
     radius_m = math.sqrt(CYLINDER_POINTS / math.pi) * earlier.pitch_m
     places_m = np.concatenate([cores_m, _on_reference(cloud, centres_m)])
-    _, near = cKDTree(earlier_m).query(np.nan_to_num(places_m), k=NORMAL_POINTS)
-    normals = local_normals(earlier_m[near])
+    _, neighbours = cKDTree(earlier_m).query(np.nan_to_num(places_m), k=NORMAL_POINTS)
+    normals = local_normals(earlier_m[neighbours])
     # out of the camera, so that a deeper place has a positive distance
     normals[(normals * np.nan_to_num(places_m)).sum(axis=1) < 0] *= -1.0
     measured = distances(

@@ -112,7 +112,7 @@ class Contender:
 class _Sought:
     """The holes that candidates found of the same ones."""
 
-    found: dict[str, np.ndarray]
+    hits: dict[str, np.ndarray]
     """By candidate (n,) bool: which of the holes it found."""
     widths_mm: tuple[float, float]
     """Smallest and largest."""
@@ -148,8 +148,8 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
         return noted(first, "as only it has these settings")
     if not cloud.organised:
         return noted(first, "as holes cannot be implanted without a grid of pixels")
-    known = [candidate for candidate in candidates if candidate.is_known]
-    compared = known or list(candidates)
+    with_known_rate = [candidate for candidate in candidates if candidate.is_known]
+    compared = with_known_rate or list(candidates)
     if len(compared) == 1:
         return noted(compared[0], "as only its number of false calls is known")
     reach_px = cloud.noise_reach_px
@@ -168,11 +168,11 @@ def chosen(candidates: Sequence[Contender], cloud: Cloud, calls: str) -> Contend
     preferred = sorted(compared, key=lambda c: _rank(c.detector.name, reach_px))
     best = preferred[0]
     for rival in preferred[1:]:
-        if _is_better(sought.found[rival.detector.name], sought.found[best.detector.name]):
+        if _is_better(sought.hits[rival.detector.name], sought.hits[best.detector.name]):
             best = rival
     facts = {
-        "found": {name: int(found.sum()) for name, found in sought.found.items()},
-        "implanted": len(next(iter(sought.found.values()))),
+        "found": {name: int(hits.sum()) for name, hits in sought.hits.items()},
+        "implanted": len(next(iter(sought.hits.values()))),
         "widths_mm": sought.widths_mm,
         "depths_mm": sought.depths_mm,
         "noise_reach_px": reach_px,
@@ -211,15 +211,15 @@ def _is_better(by_first: np.ndarray, by_second: np.ndarray) -> bool:
 def _reason(name: str, sought: _Sought, calls: str, pixels: str) -> str:
     """Say what the chosen detector found of the holes, and the others. ``pixels``: their kind in
     words, which decides where chance explains that others found as many or more."""
-    counts = {other: int(found.sum()) for other, found in sought.found.items()}
-    own = counts.pop(name)
-    others = ", ".join(f"{other} {count}" for other, count in counts.items())
+    counts = {other: int(hits.sum()) for other, hits in sought.hits.items()}
+    own_count = counts.pop(name)
+    rivals = ", ".join(f"{other} {count}" for other, count in counts.items())
     narrow, wide = sought.widths_mm
     shallow, deep = sought.depths_mm
     sizes = f"{narrow:.2g} to {wide:.2g} mm wide and {shallow:.2g} to {deep:.2g} mm deep"
-    holes = len(sought.found[name])
-    text = f"as it found {own} of {holes} implanted holes ({sizes}) at {calls}; {others}"
-    if own <= max(counts.values()):
+    holes = len(sought.hits[name])
+    text = f"as it found {own_count} of {holes} implanted holes ({sizes}) at {calls}; {rivals}"
+    if own_count <= max(counts.values()):
         text += f", by chance: {name} suits {pixels}"
     return text
 
@@ -241,11 +241,11 @@ def _sought(candidates: Sequence[Contender], cloud: Cloud, reach_px: float) -> _
     pictures: list[np.ndarray] = []
     count = 0
     for _ in range(MOST_ROUNDS):
-        places = places_apart(free[rows, columns], WANTED - count, APART * half_px, stream)
-        if not len(places):
+        centres = places_apart(free[rows, columns], WANTED - count, APART * half_px, stream)
+        if not len(centres):
             break
-        pictures.append(places)
-        count += len(places)
+        pictures.append(centres)
+        count += len(centres)
     if count < FEWEST:
         return None
     residuals_m = parts[0].evidence.residual_m
@@ -254,18 +254,18 @@ def _sought(candidates: Sequence[Contender], cloud: Cloud, reach_px: float) -> _
     scale = 1.0
     for _ in range(TRIES):
         rounds = _holes(pictures, blur_px, scale * noise_m, stream)
-        found = {}
+        hits_by_name = {}
         for candidate in parts:
             of_rounds = [_found(candidate, part, holes, squares) for holes in rounds]
-            found[candidate.detector.name] = np.concatenate(of_rounds)
-        best_share = max(float(hits.mean()) for hits in found.values())
+            hits_by_name[candidate.detector.name] = np.concatenate(of_rounds)
+        best_share = max(float(hits.mean()) for hits in hits_by_name.values())
         if TELLING[0] <= best_share <= TELLING[1]:
             break
         scale *= DEEPER if best_share < TELLING[0] else 1.0 / DEEPER
     widths_mm = np.concatenate([holes.widths_px for holes in rounds]) * pitch_mm
     depths_mm = np.concatenate([holes.depths_m for holes in rounds]) / MM
     return _Sought(
-        found=found,
+        hits=hits_by_name,
         widths_mm=(float(widths_mm.min()), float(widths_mm.max())),
         depths_mm=(float(depths_mm.min()), float(depths_mm.max())),
     )
@@ -310,16 +310,16 @@ def _holes(
     """Return holes at the places (n, 2) of each picture: all widths and depths in turn, in random
     order."""
     sizes = [(width, depth) for depth in DEPTHS for width in WIDTHS]
-    count = sum(len(places) for places in pictures)
+    count = sum(len(centres) for centres in pictures)
     order = stream.permutation(np.arange(count) % len(sizes))
     rounds = []
     done = 0
-    for places in pictures:
-        taken = np.array([sizes[n] for n in order[done : done + len(places)]])
-        done += len(places)
+    for centres in pictures:
+        taken = np.array([sizes[n] for n in order[done : done + len(centres)]])
+        done += len(centres)
         holes = VirtualHoles(
-            rows=places[:, 0],
-            columns=places[:, 1],
+            rows=centres[:, 0],
+            columns=centres[:, 1],
             widths_px=taken[:, 0] * blur_px,
             depths_m=taken[:, 1] / taken[:, 0] * noise_m,
         )
@@ -339,14 +339,14 @@ def _found(
     residual_m = with_holes(candidate.evidence.residual_m, holes, squares)
     evidence = detector.rescored(cloud, candidate.evidence, residual_m)
     is_behind = behind(evidence).reshape(-1)
-    called = np.zeros(cloud.valid.size, bool)
+    is_called = np.zeros(cloud.valid.size, bool)
     for finding in candidate.detector.find(cloud, evidence, candidate.threshold):
-        called[finding.pixels] = is_behind[finding.pixels]
-    picture = called.reshape(cloud.valid.shape)
-    found = []
+        is_called[finding.pixels] = is_behind[finding.pixels]
+    picture = is_called.reshape(cloud.valid.shape)
+    hits = []
     for row, column, width_px in zip(holes.rows, holes.columns, holes.widths_px, strict=True):
         half = int(width_px / 2)
         rows = slice(max(row - half, 0), row + half + 1)
         columns = slice(max(column - half, 0), column + half + 1)
-        found.append(bool(picture[rows, columns].any()))
-    return np.array(found)
+        hits.append(bool(picture[rows, columns].any()))
+    return np.array(hits)

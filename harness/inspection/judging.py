@@ -124,12 +124,12 @@ def with_warnings(evidence: Evidence, *warnings: str) -> Evidence:
 
 def refuse_thresholds(arguments: argparse.Namespace) -> None:
     """Raise UserError if several arguments set the threshold, or its value is not legal."""
-    given = []
+    stated = []
     for name in THRESHOLDS:
         if getattr(arguments, name) is not None:
-            given.append(f"--{name.replace('_', '-')}")
-    if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} set the threshold", fix="give one of them")
+            stated.append(f"--{name.replace('_', '-')}")
+    if len(stated) > 1:
+        raise UserError(f"{' and '.join(stated)} set the threshold", fix="give one of them")
     for name, value in (("threshold", arguments.threshold), ("false-calls", arguments.false_calls)):
         if value is not None and not 0 < value < float("inf"):
             raise UserError(f"--{name} {value:g}", legal="a number above 0")
@@ -157,25 +157,25 @@ def threshold_of(
         return float(default), "the detector's own", evidence
 
     wanted_calls = arguments.false_calls or cli.DEFAULT_FALSE_CALLS
-    own = own_threshold(detector, cloud, evidence, wanted_calls)
-    notes: dict[str, Any] = {**evidence.notes, "own_null": null_facts(own)}
-    searched = replace(own.evidence, notes=notes)
-    peaks = _peaks_text(own, cloud)
-    if own.doubts:
+    by_peaks = own_threshold(detector, cloud, evidence, wanted_calls)
+    notes: dict[str, Any] = {**evidence.notes, "own_null": null_facts(by_peaks)}
+    searched = replace(by_peaks.evidence, notes=notes)
+    peaks = _peaks_text(by_peaks, cloud)
+    if by_peaks.doubts:
         k = DEFAULT_K
-        if math.isfinite(own.threshold):
-            k = max(DEFAULT_K, own.threshold)
+        if math.isfinite(by_peaks.threshold):
+            k = max(DEFAULT_K, by_peaks.threshold)
         used = f"the capture cannot set its own threshold, {k:.3g} is used"
-        warnings = [f"{used}: {why}" for why in own.doubts]
+        warnings = [f"{used}: {why}" for why in by_peaks.doubts]
         unknown = "the number of false calls is unknown"
         origin = f"{FALLBACK}, {k:.3g} units of score: {unknown}; {peaks}"
         return k, origin, replace(searched, warnings=(*evidence.warnings, *warnings))
-    expected = FalseCalls(own.expected, own.low, own.high).text
+    expected = FalseCalls(by_peaks.expected, by_peaks.low, by_peaks.high).text
     at_marks = ""
-    if own.at_marks >= LEAST_AT_MARKS:
-        at_marks = f", {calls_text(own.at_marks)} of them at objects, print and edges"
+    if by_peaks.at_marks >= LEAST_AT_MARKS:
+        at_marks = f", {calls_text(by_peaks.at_marks)} of them at objects, print and edges"
     origin = f"from this capture's own null: {expected}{at_marks}, from {peaks}"
-    return own.threshold, origin, searched
+    return by_peaks.threshold, origin, searched
 
 
 def null_facts(own: OwnThreshold) -> dict[str, Any]:

@@ -129,16 +129,16 @@ def found_at(
     disc = Disc(diameter_m, depth_m)
     free = free_area(result)
     hits = 0
-    places = 0
+    trials = 0
     for number in range(MOST_ROUNDS):
         count = _counted(detector, result, threshold, free, disc, round_number=number)
         if count is None:
             break
         hits += count.hits
-        places += count.places
-        if places >= MOST_PLACES:
+        trials += count.places
+        if trials >= MOST_PLACES:
             break
-    return _size_count(disc, hits, places) if places else None
+    return _size_count(disc, hits, trials) if trials else None
 
 
 def _refuse_ungridded(result: Judged) -> None:
@@ -265,8 +265,8 @@ def free_area(result: Judged) -> np.ndarray:
     occupied = np.zeros(result.cloud.valid.size, bool)
     for detection in result.detections:
         occupied[detection.pixels] = True
-    near = grown(occupied.reshape(result.cloud.valid.shape), math.ceil(APART_PX / 2))
-    return np.isfinite(result.evidence.score) & result.cloud.valid & ~near
+    beside_findings = grown(occupied.reshape(result.cloud.valid.shape), math.ceil(APART_PX / 2))
+    return np.isfinite(result.evidence.score) & result.cloud.valid & ~beside_findings
 
 
 def places_for(result: Judged, free: np.ndarray, disc: Disc, round_number: int = 0) -> np.ndarray:
@@ -280,7 +280,7 @@ def places_for(result: Judged, free: np.ndarray, disc: Disc, round_number: int =
     size = f"{disc.diameter_m / MM:.6f} mm"
     shuffled = random_stream(round_number, "limit", size).permutation(candidates)
     area_px = math.pi * max(radius_px, 0.5) ** 2
-    most = min(MOST_PLACES, max(1, int(MOST_SHARE * free.sum() / area_px)))
+    limit = min(MOST_PLACES, max(1, int(MOST_SHARE * free.sum() / area_px)))
     apart_px = 2 * radius_px + APART_PX
     taken: list[tuple[int, int]] = []
     chosen = []
@@ -289,7 +289,7 @@ def places_for(result: Judged, free: np.ndarray, disc: Disc, round_number: int =
         if all(math.hypot(row - v, column - u) >= apart_px for v, u in taken):
             taken.append((row, column))
             chosen.append(int(pixel))
-        if len(chosen) == most:
+        if len(chosen) == limit:
             break
     return np.array(chosen, int)
 

@@ -131,7 +131,7 @@ def choice_facts(choice: Choice | None) -> dict[str, Any] | None:
             "extent_mm": [side / MM for side in area.extent_m],
             "share_of_view": area.share,
             "tilt_deg": area.tilt_deg,
-            "pixels": int(area.own.sum()),
+            "pixels": int(area.mask.sum()),
         }
         candidates.append(facts)
     return {"taken": choice.taken, "warnings": choice.warnings, "candidates": candidates}
@@ -204,9 +204,9 @@ def print_findings(findings: Sequence[Finding], grid: str = "px", is_written: bo
         return
     shown = findings[:MOST_ROWS]
     show([_findings_grid(shown, grid)])
-    further = len(findings) - len(shown)
-    if further:
-        print(f"... and {further} more{_where_written(is_written)}")
+    unshown = len(findings) - len(shown)
+    if unshown:
+        print(f"... and {unshown} more{_where_written(is_written)}")
 
 
 def _where_written(is_written: bool) -> str:

@@ -27,17 +27,17 @@ def changes_section(changes: Changes) -> Markup:
         rows.append((str(change.id), change.state, *sizes, distance))
     if rows:
         parts.append(Grid.of(CHANGE_HEADS, rows, left=2).html())
-    how = (
+    explanation = (
         "All sizes are in mm. Then and now: what each capture shows there against a smooth surface;"
         " a dash where it shows no damage. Change: distance between both captures at the middle"
         " of the damage, averaged over a cylinder along the normal, with its level of detection at"
         " 95 % (M3C2) in brackets; it holds the noise of both captures, the placement, and what"
         " unchanged places differ by."
     )
-    parts.append(paragraph(how))
-    further = len(changes.damage) - MOST_ROWS
-    if further > 0:
-        parts.append(paragraph(f"{further} more are in findings.json."))
+    parts.append(paragraph(explanation))
+    unshown = len(changes.damage) - MOST_ROWS
+    if unshown > 0:
+        parts.append(paragraph(f"{unshown} more are in findings.json."))
     return joined(parts)
 
 

@@ -53,8 +53,8 @@ def captures_in(path: Path) -> tuple[Path, ...]:
     if entries and all(entry.is_dir() for entry in entries):
         # the folders of one capture: depth/ beside color/
         return () if (path / "depth").is_dir() else tuple(entries)
-    whole = all(entry.suffix.lower() in WHOLE_FILES for entry in entries)
-    return tuple(entries) if whole else ()
+    are_captures = all(entry.suffix.lower() in WHOLE_FILES for entry in entries)
+    return tuple(entries) if are_captures else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +163,8 @@ class CapturedReference:
         if left_out is not None:
             assert self.stack is not None
             scan = self.stack.mean(f"{len(self.parts) - 1} other good parts", left_out)
-        known = pose_by_marks(self.parts[0], part)
-        return replace(part.cloud, expected=laid_under(scan, part.cloud, part.mask, known))
+        known_pose = pose_by_marks(self.parts[0], part)
+        return replace(part.cloud, expected=laid_under(scan, part.cloud, part.mask, known_pose))
 
 
 Reference = DrawnReference | CapturedReference
@@ -199,8 +199,8 @@ def captured_reference(
     if not captures:
         earlier = replace(first, name=f"the earlier capture {path.name}")
         return CapturedReference(path, recordings, parts, earlier, None)
-    others = [(part.scan, pose_by_marks(part, parts[0])) for part in parts[1:]]
-    stack = good_parts(first, others, parts[0].cloud.projection == "central")
+    later_scans = [(part.scan, pose_by_marks(part, parts[0])) for part in parts[1:]]
+    stack = good_parts(first, later_scans, parts[0].cloud.projection == "central")
     name = f"{many(len(parts), 'good part')} in {path.name}"
     return CapturedReference(path, recordings, parts, stack.mean(name), stack)
 
@@ -223,10 +223,10 @@ class CheckOnParts:
     @property
     def text(self) -> str:
         """Return the check in words."""
-        found = f"{many(self.findings, 'finding')} on {self.parts} good parts, each left out once"
+        count = f"{many(self.findings, 'finding')} on {self.parts} good parts, each left out once"
         if self.factor == 1.0:
-            return f"not more than expected: {found}"
-        return f"raised {self.factor:.2g} times: {found}"
+            return f"not more than expected: {count}"
+        return f"raised {self.factor:.2g} times: {count}"
 
 
 def checked_on_parts(

@@ -820,14 +820,14 @@ def _limit_section(limit: Limit) -> Markup:
     rows = []
     for size in limit.sizes:
         share = f"{100 * size.low:.0f} to {100 * size.high:.0f} %"
-        found = f"{size.hits} of {size.places}"
-        rows.append((f"{size.diameter_mm:.2f}", f"{size.depth_mm:.2f}", found, share))
+        count = f"{size.hits} of {size.places}"
+        rows.append((f"{size.diameter_mm:.2f}", f"{size.depth_mm:.2f}", count, share))
     sentence = f"{limit.text[0].upper()}{limit.text[1:]}."
-    how = (
+    explanation = (
         "Flat discs were pressed into this capture's cloud at places without findings, blurred by"
         " the camera's filter, and searched by the same detector at the same threshold."
     )
-    return joined([paragraph(sentence), paragraph(how), Grid.of(heads, rows).html()])
+    return joined([paragraph(sentence), paragraph(explanation), Grid.of(heads, rows).html()])
 
 
 def _registration_text(registration: Mapping[str, Any]) -> str:

@@ -53,12 +53,12 @@ class Sheets:
         """Return the page as text; it needs no network."""
         name, view = best_view(result)
         limits = " and ".join(tolerance.text for tolerance in self.decision.tolerances)
-        about = [*self.about[:2], ("tolerance", limits), *self.about[2:]]
+        rows = [*self.about[:2], ("tolerance", limits), *self.about[2:]]
         missed = self.decision.missed.text
         return template("decision.html").render(
             title=f"Decision on {self.about[0][1]}",
             answer=f"{self.decision.verdict}.",
-            about=definitions(about),
+            about=definitions(rows),
             decisions=decisions_table(self.decision),
             rule=rule_text(),
             signature=definitions((name, "") for name in SIGNED),
@@ -107,9 +107,9 @@ def decisions_table(decision: PartDecision) -> Markup:
     if not rows:
         return Markup("")
     parts = [Grid.of(HEADS, rows, left=4).html()]
-    further = len(entries) - MOST_ROWS
-    if further > 0:
-        parts.append(paragraph(f"{further} more are in decision.json."))
+    unshown = len(entries) - MOST_ROWS
+    if unshown > 0:
+        parts.append(paragraph(f"{unshown} more are in decision.json."))
     return joined(parts)
 
 

@@ -77,8 +77,8 @@ class Tolerance:
     @property
     def text(self) -> str:
         """Return ``depth of at most 0.5 mm``."""
-        of = " from the drawing" if self.kind == "deviation" else ""
-        return f"{self.kind}{of} of at most {self.limit:g} {KINDS[self.kind]}"
+        origin = " from the drawing" if self.kind == "deviation" else ""
+        return f"{self.kind}{origin} of at most {self.limit:g} {KINDS[self.kind]}"
 
 
 def tolerances_from(texts: Sequence[str], *, has_drawing: bool) -> tuple[Tolerance, ...]:
@@ -270,8 +270,8 @@ class PartDecision:
                 listed = joined_words([str(number) for number in sorted(numbers)])
                 prefix = "" if decision == self.decision else f"{decision}: "
                 counts.append(f"{prefix}finding{'s' * (len(numbers) > 1)} {listed}")
-        found = f" ({'; '.join(counts)})" if counts else ""
-        return f"{self.verdict}{found}"
+        numbers_text = f" ({'; '.join(counts)})" if counts else ""
+        return f"{self.verdict}{numbers_text}"
 
     @property
     def sentence(self) -> str:
@@ -475,8 +475,8 @@ def _on_deviation(result: Judged, tolerance: Tolerance) -> FindingDecision:
     assert cloud.expected is not None
     deviation_mm = deviations_mm(result)
     means_mm, counts = _windowed(deviation_mm)
-    known = np.isfinite(means_mm)
-    if not known.any() or not cloud.organised:
+    is_finite = np.isfinite(means_mm)
+    if not is_finite.any() or not cloud.organised:
         return FindingDecision(
             id=THE_PART,
             kind=tolerance.kind,
@@ -486,19 +486,19 @@ def _on_deviation(result: Judged, tolerance: Tolerance) -> FindingDecision:
             decision=UNDECIDED,
             reason="no grid of pixels was compared with the drawing",
         )
-    place = int(np.nanargmax(np.abs(means_mm)))
-    count = float(counts.ravel()[place])
-    noise_mm = sigma_of((deviation_mm - means_mm)[known & np.isfinite(deviation_mm)])
+    peak = int(np.nanargmax(np.abs(means_mm)))
+    count = float(counts.ravel()[peak])
+    noise_mm = sigma_of((deviation_mm - means_mm)[is_finite & np.isfinite(deviation_mm)])
     # windows that do not overlap
-    windows = max(1, round(int(known.sum()) / WINDOW_PX**2))
+    windows = max(1, round(int(is_finite.sum()) / WINDOW_PX**2))
     largest = float(norm.ppf(1.0 - RISK / windows)) / GUARD
     of_window_mm = noise_mm * math.sqrt(_shared(cloud, round(count)))
-    point_m = cloud.points_m.reshape(-1, 3)[place : place + 1]
+    point_m = cloud.points_m.reshape(-1, 3)[peak : peak + 1]
     contributions = (
         Contribution(f"noise, of the largest of {windows} places", largest * of_window_mm),
         Contribution("registration", _registration_mm(cloud, point_m)),
     )
-    value = float(abs(means_mm.ravel()[place]))
+    value = float(abs(means_mm.ravel()[peak]))
     uncertainty = combined(contributions)
     return FindingDecision(
         id=THE_PART,
@@ -522,12 +522,14 @@ def deviations_mm(result: Judged) -> np.ndarray:
 def _windowed(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the means (h, w) over windows of `WINDOW_PX` with at least half of their values, else
     NaN, and the numbers of these."""
-    known = np.isfinite(values)
+    is_finite = np.isfinite(values)
     side = (WINDOW_PX, WINDOW_PX)
     border = cv2.BORDER_CONSTANT
-    sums = cv2.boxFilter(np.where(known, values, 0.0), -1, side, normalize=False, borderType=border)
-    counts = cv2.boxFilter(known.astype(float), -1, side, normalize=False, borderType=border)
-    enough = known & (counts >= WINDOW_PX**2 / 2)
+    sums = cv2.boxFilter(
+        np.where(is_finite, values, 0.0), -1, side, normalize=False, borderType=border
+    )
+    counts = cv2.boxFilter(is_finite.astype(float), -1, side, normalize=False, borderType=border)
+    enough = is_finite & (counts >= WINDOW_PX**2 / 2)
     return np.where(enough, sums / np.maximum(counts, 1.0), np.nan), counts
 
 

@@ -280,8 +280,8 @@ def _neighbour_steps(surface_m: np.ndarray, axis: int) -> np.ndarray:
     later[axis] = slice(1, None)
     earlier[axis] = slice(None, -1)
     steps[tuple(later)] = between
-    known = np.isfinite(between).all(axis=-1)
-    steps[tuple(earlier)][known] = between[known]
+    is_finite = np.isfinite(between).all(axis=-1)
+    steps[tuple(earlier)][is_finite] = between[is_finite]
     return steps
 
 
@@ -290,14 +290,14 @@ def _plan_areas_m2(surface_m: np.ndarray) -> np.ndarray:
 
     The squares hold about `POINTS_IN_SQUARE` points, so that few inside the cloud are empty."""
     areas = np.full(surface_m.shape[:2], np.nan)
-    known = np.isfinite(surface_m).all(axis=-1)
-    plan_m = surface_m[known][:, :2]
+    is_finite = np.isfinite(surface_m).all(axis=-1)
+    plan_m = surface_m[is_finite][:, :2]
     if len(plan_m) < 2 * POINTS_IN_SQUARE:
         return areas
     box_m2 = float(np.prod(np.ptp(plan_m, axis=0)))
     side_m = math.sqrt(max(box_m2, 1e-12) * POINTS_IN_SQUARE / len(plan_m))
     squares = np.unique(np.floor((plan_m - plan_m.min(axis=0)) / side_m), axis=0)
-    areas[known] = len(squares) * side_m**2 / len(plan_m)
+    areas[is_finite] = len(squares) * side_m**2 / len(plan_m)
     return areas
 
 
@@ -474,16 +474,16 @@ def _other_clauses(findings: Sequence[Finding], *, is_further: bool) -> list[str
             blind += finding.kind == "no return"
             cut += finding.kind != "no return"
     clauses: list[str] = []
-    for count, one, several in (
+    for count, singular, plural in (
         (doubtful, "is doubtful", "are doubtful"),
         (cut, "is cut by the rim", "are cut by the rim"),
         (blind, "returned no light", "returned no light"),
     ):
         if count:
             word = WORDS[count] if count < len(WORDS) else str(count)
-            further = " further" if is_further and not clauses else ""
-            place = "place" if count == 1 else "places"
-            clauses.append(f"{word}{further} {place} {one if count == 1 else several}")
+            adjective = " further" if is_further and not clauses else ""
+            noun = "place" if count == 1 else "places"
+            clauses.append(f"{word}{adjective} {noun} {singular if count == 1 else plural}")
     return clauses
 
 

@@ -243,19 +243,25 @@ SUMMARY = Table(
         _mean("extent_diameter", "extent (mm)"),
         _mean("model_diameter", "model (mm)"),
         *(
-            Column(f"{k}_{name}", note=f"{note} ({by})")
-            for k, by in BY
+            Column(f"{k}_{name}", note=f"{note} ({estimator})")
+            for k, estimator in BY
             for name, note in STATISTICS.items()
         ),
         *(
-            Column(f"{k}_bias_mm", note=f"mean diameter minus true diameter ({by})", interval=True)
-            for k, by in BY
+            Column(
+                f"{k}_bias_mm",
+                note=f"mean diameter minus true diameter ({estimator})",
+                interval=True,
+            )
+            for k, estimator in BY
         ),
         *(
             Column(
-                f"{k}_error_mean_mm", f"centre off, {k} (mm)", note=f"mean error of place ({by})"
+                f"{k}_error_mean_mm",
+                f"centre off, {k} (mm)",
+                note=f"mean error of place ({estimator})",
             )
-            for k, by in BY
+            for k, estimator in BY
         ),
         Column(
             "model_diameter_se_mean_mm",

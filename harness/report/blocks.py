@@ -109,11 +109,11 @@ def split_answer(answer: str) -> tuple[str, str]:
     ):
         count += 1
     headline = " ".join(clauses[:count])
-    further = " ".join(clauses[count:])
+    continuation = " ".join(clauses[count:])
     if headline.endswith(";"):
         headline = f"{headline[:-1]}."
-        further = f"{further[0].upper()}{further[1:]}"
-    return headline, further
+        continuation = f"{continuation[0].upper()}{continuation[1:]}"
+    return headline, continuation
 
 
 # ---------------------------------------------------------------- elements

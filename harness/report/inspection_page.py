@@ -295,9 +295,9 @@ def class_sections(findings: Sequence[Finding], classes: Mapping[str, str]) -> l
         if members:
             sections.append(tag("p", f"{meaning[0].upper()}{meaning[1:]}.", kind="note"))
             sections.append(findings_grid(members[:MOST_ROWS]).html())
-            further = members[MOST_ROWS:]
-            if further:
-                sections.append(fold(f"{len(further)} more", findings_grid(further).html()))
+            unshown = members[MOST_ROWS:]
+            if unshown:
+                sections.append(fold(f"{len(unshown)} more", findings_grid(unshown).html()))
     return sections
 
 

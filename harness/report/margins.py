@@ -87,15 +87,15 @@ def _by_size(rows_with_margins: pd.DataFrame) -> str:
 
 def _draw_margins(axes: Axes, group: pd.DataFrame, column: str) -> None:
     """Draw mean, lowest and highest margin over the repeats against a column of `SUMMARY`."""
-    places = group[column].to_numpy(float)
+    positions = group[column].to_numpy(float)
     mean = group["margin_mean"].to_numpy(float)
     low = group["margin_lowest"].to_numpy(float)
     high = group["margin_highest"].to_numpy(float)
     colours = [STATUS_COLOURS[status] for status in group["status"]]
     axes.axhline(1, color=blocks.INK, lw=0.8, ls=(0, (4, 2)))
-    axes.plot(places, mean, color=blocks.GREY, lw=1, label="score / threshold")
-    axes.vlines(places, np.maximum(low, LABELLED[0]), high, colors=colours, lw=2)
-    axes.scatter(places, mean, c=colours, s=16, zorder=3)
+    axes.plot(positions, mean, color=blocks.GREY, lw=1, label="score / threshold")
+    axes.vlines(positions, np.maximum(low, LABELLED[0]), high, colors=colours, lw=2)
+    axes.scatter(positions, mean, c=colours, s=16, zorder=3)
 
 
 def _margin_axis(axes: Axes, rows_with_margins: pd.DataFrame) -> None:

@@ -53,7 +53,7 @@ def write_report(
     result of `summaries`. Claims are judged for a target that has some. The same input gives the
     same bytes. Raises UserError if the folder cannot be written."""
     facts = facts or {}
-    about = sections.About(
+    origin = sections.About(
         provenance=provenance,
         experiment_yaml_text=experiment_yaml_text,
         title=title,
@@ -63,11 +63,11 @@ def write_report(
     clouds = [example for example in examples if isinstance(example, ExampleCloud)]
     maps = [example for example in examples if isinstance(example, MappedExample)]
     if len(tables.registrations):
-        text = perspectives_html(tables, maps, about, computed)
+        text = perspectives_html(tables, maps, origin, computed)
     elif len(set_ups_of(tables)) > 1:
-        text = set_ups_html(tables, clouds, about, computed)
+        text = set_ups_html(tables, clouds, origin, computed)
     else:
-        text = report_html(tables, clouds, about, computed)
+        text = report_html(tables, clouds, origin, computed)
     for name, example in map_files(maps).items():
         write_view3d(Path(folder) / name, example.scene, map_text(example))
     path = Path(folder) / REPORT.name

@@ -185,8 +185,8 @@ def _best(set_ups: Sequence[SetUpResult], examples: Sequence[StudyExample]) -> S
     """Return the smallest limit of the set-ups with examples, among those that limit the same size
     as the first (a width and a diameter do not compare); None if there is none."""
     limits = [set_up.limit for set_up in set_ups if _examples_of(set_up.limit, examples)]
-    alike = [limit for limit in limits if _limited_size(limit) == _limited_size(limits[0])]
-    return min(alike, key=lambda limit: limit.a90_95.value, default=None)
+    comparable = [limit for limit in limits if _limited_size(limit) == _limited_size(limits[0])]
+    return min(comparable, key=lambda limit: limit.a90_95.value, default=None)
 
 
 def _limited_size(limit: SetUpLimit) -> str:

@@ -37,7 +37,7 @@ def solid_of(gauge: SolidGauge) -> trimesh.Trimesh:
         larger = float(np.cbrt(4 / 3 * np.pi * radius_mm**3 / sphere.volume()))
         sphere = sphere.scale((larger, larger, larger))
         bodies.append(sphere.translate((ball.x_mm, ball.y_mm, ball.z_mm)))
-    whole = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
+    body = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
     cutters = [*_marks_of(gauge, above_mm=OVERLAP_MM)]
     for pocket in gauge.pockets:
         deep_mm = pocket.depth_mm + OVERLAP_MM
@@ -52,7 +52,7 @@ def solid_of(gauge: SolidGauge) -> trimesh.Trimesh:
             y_mm = groove.y_mm + end * straight_mm / 2
             end_mm = (groove.x_mm, y_mm, -groove.depth_mm)
             cutters.append(_cylinder(groove.width_mm, deep_mm, end_mm))
-    cut = manifold3d.Manifold.batch_boolean([whole, *cutters], manifold3d.OpType.Subtract)
+    cut = manifold3d.Manifold.batch_boolean([body, *cutters], manifold3d.OpType.Subtract)
     return _mesh(cut)
 
 

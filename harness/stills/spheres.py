@@ -212,12 +212,12 @@ def fit_sphere(
     ranges_m = image.range_m.ravel()
     rays = image.rays.reshape(-1, 3)
     limit_m = WIDEST * radius_m
-    near = disc(image, centre_m, 2 * radius_m)
+    wide_disc = disc(image, centre_m, 2 * radius_m)
     if most_px is not None:
         # the wider disc has some four times as many
-        near = near[:: len(near) // (4 * most_px) + 1]
+        wide_disc = wide_disc[:: len(wide_disc) // (4 * most_px) + 1]
     for _ in range(12):
-        pixels = disc(image, centre_m, radius_m, near)
+        pixels = disc(image, centre_m, radius_m, wide_disc)
         present = pixels[np.isfinite(ranges_m[pixels])]
         if len(present) < FEWEST_PX:
             return NoFit(f"{len(present)} pixels with a range, {FEWEST_PX} needed")
@@ -299,8 +299,10 @@ def _finished(
     """Return the fit with the errors of the centre, and with the free radius."""
     ranges_m = image.range_m.ravel()[used]
     rays = image.rays.reshape(-1, 3)[used]
-    held = _model(rays, centre_m, radius_m)
-    covariance_m2 = _covariance(image, used, held.jacobian[:, :3], ranges_m - held.range_m, held)
+    fixed_radius = _model(rays, centre_m, radius_m)
+    covariance_m2 = _covariance(
+        image, used, fixed_radius.jacobian[:, :3], ranges_m - fixed_radius.range_m, fixed_radius
+    )
     free_centre_m = centre_m.copy()
     free_radius_m = radius_m
     for _ in range(20):
@@ -356,19 +358,19 @@ def correlated_pixels(
     reach = int(np.clip(LAG_SHARE * np.sqrt(count), *LAGS_PX))
     picture = np.zeros(shape)
     picture.ravel()[used] = values
-    seen = np.zeros(shape)
-    seen.ravel()[used] = 1.0
+    is_used = np.zeros(shape)
+    is_used.ravel()[used] = 1.0
     rows, columns = np.divmod(used, shape[1])
     window = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
     picture = np.pad(picture[window], reach)
-    seen = np.pad(seen[window], reach)
+    is_used = np.pad(is_used[window], reach)
     variance = float((picture**2).sum()) / count
     if variance == 0:
         return 1.0
     total = 0.0
     lags = range(-reach, reach + 1)
     for shift in [(row, column) for row in lags for column in lags]:
-        pairs = float((seen * np.roll(seen, shift, (0, 1))).sum())
+        pairs = float((is_used * np.roll(is_used, shift, (0, 1))).sum())
         product = float((picture * np.roll(picture, shift, (0, 1))).sum())
         total += product / max(pairs, 1.0) / variance
     lost = numbers * len(lags) ** 2 / count
@@ -382,15 +384,15 @@ def find_spheres(image: RangeImage, radius_m: float) -> list[SphereFit]:
     """Return the spheres of a stated radius, nearest first, without overlaps."""
     fits: list[SphereFit] = []
     for start_m in _candidates(image, radius_m):
-        known = [np.linalg.norm(fit.centre_m - start_m) < radius_m for fit in fits]
-        if any(known):
+        is_fitted = [np.linalg.norm(fit.centre_m - start_m) < radius_m for fit in fits]
+        if any(is_fitted):
             continue
         fit = fit_sphere(image, start_m, radius_m, most_px=SCREENED_PX)
         if isinstance(fit, SphereFit):
             fit = fit_sphere(image, fit.centre_m, radius_m)
         if isinstance(fit, NoFit) or not _has_size(fit):
             continue
-        apart_m = [np.linalg.norm(fit.centre_m - other.centre_m) for other in fits]
+        apart_m = [np.linalg.norm(fit.centre_m - earlier_fit.centre_m) for earlier_fit in fits]
         if min(apart_m, default=np.inf) > 1.5 * radius_m:
             fits.append(fit)
         if len(fits) == MOST_SPHERES:
@@ -423,11 +425,11 @@ def _candidates(image: RangeImage, radius_m: float) -> Iterator[np.ndarray]:
         _, cell, counts = np.unique(number, return_inverse=True, return_counts=True)
         votes = np.bincount(cell, density)
         sums_m = np.stack([np.bincount(cell, axis_m) for axis_m in centres_m.T], axis=1)
-        many = (votes >= LEAST_VOTES) & (counts >= FEWEST_PX / 4)
+        is_dense = (votes >= LEAST_VOTES) & (counts >= FEWEST_PX / 4)
         # in deviations of the votes of a plane: far away, a cell has few votes, which scatter
         pixels = counts / votes
-        most_votes.append(((votes - OF_PLANE) * np.sqrt(pixels))[many])
-        places_m.append((sums_m / counts[:, None])[many])
+        most_votes.append(((votes - OF_PLANE) * np.sqrt(pixels))[is_dense])
+        places_m.append((sums_m / counts[:, None])[is_dense])
     order = np.argsort(-np.concatenate(most_votes))
     ordered_m = np.concatenate(places_m)[order]
     for _ in range(MOST_CANDIDATES):
@@ -448,9 +450,9 @@ def _votes(image: RangeImage, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
     inverse = np.where(valid, 1 / np.where(valid, z_m, 1.0), 0.0)
     u = np.where(valid, np.nan_to_num(slopes[..., 0]), 0.0)
     v = np.where(valid, np.nan_to_num(slopes[..., 1]), 0.0)
-    one = valid.astype(float)
+    ones = valid.astype(float)
     # a plane a z + b x + c y = 1 is linear in slopes: 1/z = a + b u + c v
-    channels = (one, u, v, u * u, u * v, v * v, inverse, inverse * u, inverse * v)
+    channels = (ones, u, v, u * u, u * v, v * v, inverse, inverse * u, inverse * v)
     wanted_px = WINDOW * radius_m / pitch / np.where(valid, image.range_m, np.inf)
     nearest = np.abs(np.log(np.maximum(wanted_px, 0.5))[..., None] - np.log(WINDOWS_PX))
     chosen = nearest.argmin(axis=-1)

@@ -52,8 +52,8 @@ def damage_kind(option: str, word: str, kinds: Iterable[str]) -> str:
 
 def kind_called(word: str) -> str:
     """Return the kind of damage that people call so, else the word itself."""
-    called = {_folded(said): kind for said, kind in DAMAGE.items()}
-    return called.get(_folded(word), word)
+    kind_of_word = {_folded(said): kind for said, kind in DAMAGE.items()}
+    return kind_of_word.get(_folded(word), word)
 
 
 def _folded(word: object) -> str:

@@ -163,8 +163,8 @@ def between_nodes(  # type: ignore[no-untyped-def]
         # range changes by the imaginary part of turn times a change at the node
         for line in range(line_count):
             k = lines[line]
-            whole = total[k, i] + light[k, i]
-            turn[line] = weights[line] * share[k, i] / whole if whole != 0 else 0j
+            phasor = total[k, i] + light[k, i]
+            turn[line] = weights[line] * share[k, i] / phasor if phasor != 0 else 0j
         square = 0.0
         for batch in range(batch_count):
             change = 0.0

@@ -146,8 +146,8 @@ def gather_at_points(
         last = dr.select(guided, guided_count - 1, mi.UInt32(cell_count - 1))
         number = dr.minimum(mi.UInt32(position), last)
         cell = dr.select(guided, dr.gather(mi.UInt32, cell_table, number, guided), number)
-        rest = dr.minimum(position - mi.Float(number), 1.0)
-        across = (mi.Float(cell % CELLS) + rest) / CELLS
+        fraction = dr.minimum(position - mi.Float(number), 1.0)
+        across = (mi.Float(cell % CELLS) + fraction) / CELLS
         down = (mi.Float(cell // CELLS) + u2) / CELLS
         weight = 1 / dr.gather(mi.Float, density, cell)
         return cosine_start(index, across, down)._replace(weight=weight)
@@ -273,10 +273,10 @@ def _gather(
     lanes_per_pair = np.repeat(-(-per_batch // PATHS_A_LANE), BATCHES)
     first_lanes = np.cumsum(lanes_per_pair) - lanes_per_pair
     pair = np.repeat(np.arange(len(lanes_per_pair)), lanes_per_pair)
-    place, batch = np.divmod(pair, BATCHES)
+    origin, batch = np.divmod(pair, BATCHES)
     first = (np.arange(len(pair)) - first_lanes[pair]) * PATHS_A_LANE
-    count = np.minimum(per_batch[place] - first, PATHS_A_LANE)
-    lanes = np.stack([place, batch, earlier + first, count])
+    count = np.minimum(per_batch[origin] - first, PATHS_A_LANE)
+    lanes = np.stack([origin, batch, earlier + first, count])
 
     lines = len(work.frequencies_hz)
     at_once = max(FLOATS_AT_ONCE // (2 * lines + 1), 1)

@@ -233,10 +233,10 @@ def _light_in_pixels(
     samples = np.where(within, samples, 0).astype(np.int64)
     noisy = samples > first
     if noisy.any():
-        further = gather_in_pixels(
+        additional = gather_in_pixels(
             lit, rays.chosen(noisy), work, (samples - first)[noisy], after=first
         )
-        light[..., noisy] += (1 - first / samples[noisy]) * (further - light[..., noisy])
+        light[..., noisy] += (1 - first / samples[noisy]) * (additional - light[..., noisy])
     return light
 
 
@@ -257,13 +257,13 @@ def _expected_noise_m(
     ``total`` (f, p): all other light. ``within`` (p,): which pixels count. ``mean`` (p,): indirect
     phasors at the first frequency. ``noise_m`` (p,): their noise."""
     rays = direct.off_face
-    others = total[0] / rays.share
-    light_variance = (noise_m * np.abs(others + mean)) ** 2
+    other_light = total[0] / rays.share
+    light_variance = (noise_m * np.abs(other_light + mean)) ** 2
     values = np.stack([within, light_variance, mean.real, mean.imag], axis=-1)
     image = np.zeros((*direct.range_m.shape, 4))
     image.reshape(-1, 4)[rays.pixel[within]] = values[within]
     sums = cv2.filter2D(image, -1, AROUND, borderType=cv2.BORDER_CONSTANT)
     sums = sums.reshape(-1, 4)[rays.pixel]
     count, variance, real, imaginary = (sums / np.maximum(sums[:, :1], 1)).T
-    expected_m = np.sqrt(variance) / np.maximum(np.abs(others + real + 1j * imaginary), 1e-30)
+    expected_m = np.sqrt(variance) / np.maximum(np.abs(other_light + real + 1j * imaginary), 1e-30)
     return np.where(count > 0, expected_m, noise_m)

@@ -526,9 +526,9 @@ class TargetConfig(SetUpConfig):
         def off_nm(albedos: WavelengthConfig) -> float:
             return abs(albedos.wavelength_nm - wavelength_nm)
 
-        near = [albedos for albedos in self.other_wavelengths if off_nm(albedos) <= NEAR_NM]
+        close_bands = [albedos for albedos in self.other_wavelengths if off_nm(albedos) <= NEAR_NM]
         nearest = min(
-            near,
+            close_bands,
             key=off_nm,
             default=None,
         )

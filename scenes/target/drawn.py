@@ -333,9 +333,9 @@ class DrawnTargetConfig(Config):
         problems = []
         needed_mm = 2 * room.rim_mm * room.shrinkage + LEAST_WEB_MM
         if self.apart_mm < needed_mm:
-            what = "damage" if isinstance(self.damage, DrawnFlaws) else "holes"
+            damage = "damage" if isinstance(self.damage, DrawnFlaws) else "holes"
             problems.append(
-                f"apart_mm: {self.apart_mm:g} mm lets {what} of {self.damage.widest_mm:g} "
+                f"apart_mm: {self.apart_mm:g} mm lets {damage} of {self.damage.widest_mm:g} "
                 "mm meet; "
                 f"it must be {needed_mm:.4g} mm or more"
             )
@@ -482,8 +482,8 @@ class DrawnTargetConfig(Config):
         if not isinstance(shape, custom.RoughConfig | custom.MadeConfig):
             return self.board
         seed = int(stream("roughness").integers(2**32))
-        own = shape.model_copy(update={"seed": seed})
-        return self.board.model_copy(update={"shape": own})
+        drawn_shape = shape.model_copy(update={"seed": seed})
+        return self.board.model_copy(update={"shape": drawn_shape})
 
     def earlier_pose(self, purpose: Purpose, number: int) -> custom.PoseConfig:
         """Return the pose in which a board was recorded before it was damaged."""
@@ -605,10 +605,10 @@ class DrawnTargetConfig(Config):
         the edge's angle."""
         half_mm = np.array([self.board.width_mm, self.board.height_mm]) / 2
         corner_mm = self.damage.widest_mm / 2 + LEAST_WEB_MM
-        places = np.empty((0, 3))
+        chips = np.empty((0, 3))
         for _ in range(ATTEMPTS * TRIES):
-            if len(places) == self.damage.per_board:
-                return places
+            if len(chips) == self.damage.per_board:
+                return chips
             share = half_mm / half_mm.sum() / 2
             turn_deg = int(rng.choice([0, 90, 180, -90], p=np.tile(share, 2)))
             turn_rad = math.radians(turn_deg)
@@ -616,9 +616,9 @@ class DrawnTargetConfig(Config):
             half_edge_mm = half_mm[0] if turn_deg in (0, 180) else half_mm[1]
             along_mm = rng.uniform(-1, 1) * (half_edge_mm - corner_mm)
             centre_mm = outward * half_mm + along_mm * np.abs(outward[::-1])
-            apart_mm = np.linalg.norm(places[:, :2] - centre_mm, axis=1)
+            apart_mm = np.linalg.norm(chips[:, :2] - centre_mm, axis=1)
             if (apart_mm >= self.apart_mm).all():
-                places = np.vstack([places, np.append(centre_mm, turn_deg)])
+                chips = np.vstack([chips, np.append(centre_mm, turn_deg)])
         raise UserError(
             f"the board's edges are too short for {self.damage.per_board} chips",
             fix="lower damage.per_board, damage.length_mm or apart_mm, or declare a larger board",

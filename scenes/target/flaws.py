@@ -344,5 +344,5 @@ def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     from_start = places_m[:, None] - line_m[:-1]
     square = np.maximum((piece**2).sum(axis=1), 1e-30)
     share = np.clip((from_start * piece).sum(axis=-1) / square, 0.0, 1.0)
-    apart = from_start - share[..., None] * piece
-    return np.asarray(np.linalg.norm(apart, axis=-1).min(axis=1))
+    to_piece = from_start - share[..., None] * piece
+    return np.asarray(np.linalg.norm(to_piece, axis=-1).min(axis=1))

@@ -391,12 +391,12 @@ def sheet(
         return np.stack(np.meshgrid(x, y), axis=-1) @ turn.T + centre_m
 
     columns, rows = _cells(face, plan(64, 64), turn, size_m, sagitta_m)
-    places = plan(columns, rows)
-    points = face.point(places[..., 0], places[..., 1])
-    normals = face.normal(places[..., 0], places[..., 1])
+    plan_m = plan(columns, rows)
+    points = face.point(plan_m[..., 0], plan_m[..., 1])
+    normals = face.normal(plan_m[..., 0], plan_m[..., 1])
     lower = points + bottom_m * normals
     if flat_back:
-        lower = np.dstack([places, np.full(places.shape[:2], bottom_m)])
+        lower = np.dstack([plan_m, np.full(plan_m.shape[:2], bottom_m)])
     vertices, faces = closed_grid(points + top_m * normals, lower)
     return trimesh.Trimesh(
         vertices=vertices,
@@ -565,8 +565,8 @@ def subtract(
     if broken:
         raise RuntimeError(f"a solid is not closed: {broken}")
     count = 1 + len(added)
-    whole = manifold3d.Manifold.batch_boolean(solids[:count], manifold3d.OpType.Add)
-    cut = manifold3d.Manifold.batch_boolean([whole, *solids[count:]], manifold3d.OpType.Subtract)
+    uncut = manifold3d.Manifold.batch_boolean(solids[:count], manifold3d.OpType.Add)
+    cut = manifold3d.Manifold.batch_boolean([uncut, *solids[count:]], manifold3d.OpType.Subtract)
     result = cut.to_mesh64()
     vertices = result.vert_properties[:, :3]
     return trimesh.Trimesh(vertices, result.tri_verts.astype(np.int64), process=False)

@@ -523,24 +523,24 @@ def test_the_kind_chooses_the_declaration() -> None:
 # --- what is known of a candidate ---
 
 
-def flat_candidate(own: np.ndarray, slope: float = 0.0, organised: bool = True) -> Candidate:
+def flat_candidate(mask: np.ndarray, slope: float = 0.0, organised: bool = True) -> Candidate:
     """Pixels of a plane z = 0.8 + slope x, seen through a lens of 200 pixels."""
-    height, width = own.shape
+    height, width = mask.shape
     lens = Lens(width, height, 200.0, 200.0, (width - 1) / 2, (height - 1) / 2)
     slopes = lens.region_slopes(lens.whole)
     z_m = 0.8 / (1.0 - slope * slopes[..., 0])
     cloud = Cloud(
         points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.zeros(own.shape, np.uint8),
-        count=np.ones(own.shape, int),
-        variance_m2=np.full(own.shape, np.nan),
+        reason=np.zeros(mask.shape, np.uint8),
+        count=np.ones(mask.shape, int),
+        variance_m2=np.full(mask.shape, np.nan),
         region=Region(0, height, 0, width),
         z_step_m=0.0,
         n_frames=1,
         organised=organised,
         lens=lens,
     )
-    return Candidate(own=own, filled=holes_filled(own), outline=own, grid=cloud)
+    return Candidate(mask=mask, filled=holes_filled(mask), outline=mask, grid=cloud)
 
 
 @pytest.mark.parametrize(
@@ -559,27 +559,27 @@ def flat_candidate(own: np.ndarray, slope: float = 0.0, organised: bool = True) 
     ],
 )
 def test_the_part_of_an_outline_that_the_picture_cuts_off(rows, columns, on_edge) -> None:
-    own = np.zeros((30, 40), bool)
-    own[slice(*rows), slice(*columns)] = True
-    own[(rows[0] + rows[1]) // 2, (columns[0] + columns[1]) // 2] = False  # a hole has no outline
+    mask = np.zeros((30, 40), bool)
+    mask[slice(*rows), slice(*columns)] = True
+    mask[(rows[0] + rows[1]) // 2, (columns[0] + columns[1]) // 2] = False  # a hole has no outline
     height = rows[1] - rows[0]
     width = columns[1] - columns[0]
     length = 2 * (height + width) - 4
     expected = on_edge if isinstance(on_edge, float) else on_edge / length
-    assert flat_candidate(own).cut_off == pytest.approx(expected)
+    assert flat_candidate(mask).cut_off == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5, 1.2, 2.5])
 def test_a_candidate_s_tilt_extent_depths_and_weight(slope: float) -> None:
     """A rectangle around the middle of a picture: sides on the plane, percentiles of z, and the
     share of the pixels under a bell about the middle, less at a grazing angle."""
-    own = np.zeros((61, 81), bool)
-    own[20:41, 30:51] = True
-    candidate = flat_candidate(own, slope)
+    mask = np.zeros((61, 81), bool)
+    mask[20:41, 30:51] = True
+    candidate = flat_candidate(mask, slope)
     assert candidate.share == pytest.approx(21 * 21 / (61 * 81))
     tilt = np.arctan(slope)
     assert candidate.tilt_deg == pytest.approx(np.degrees(tilt), abs=1e-3)
-    points = candidate.grid.points_m[own]
+    points = candidate.grid.points_m[mask]
     x, y, z = points.T
     assert candidate.depths_m == pytest.approx(tuple(np.quantile(z, (0.01, 0.5, 0.99))))
     long, short = candidate.extent_m

@@ -231,10 +231,10 @@ def _of_clusters(
     misses = np.bincount(row, fit.data.misses) / fit.repeats
     _, starts = np.unique(rows[:, 0], return_index=True)
     values = np.empty((len(widths), len(starts), len(middles)))
-    for place, width in enumerate(widths):
+    for number, width in enumerate(widths):
         predictor = half + (high - low) * (rows[:, 1:] - middles) / width
         of_rows = log_likelihoods(fit.curve.link, predictor, hits, misses)
-        values[place] = np.add.reduceat(of_rows, starts)
+        values[number] = np.add.reduceat(of_rows, starts)
     return values
 
 

@@ -90,8 +90,8 @@ def log_likelihoods(
     of `logs_of_link`."""
     t = _limited(predictor)
     values = np.zeros_like(t)
-    found = hits > 0
-    values[found] = hits[found, None] * _LOG_CDF[link](t[found])
+    has_hits = hits > 0
+    values[has_hits] = hits[has_hits, None] * _LOG_CDF[link](t[has_hits])
     missed = misses > 0
     # 1 - F(t) is the mirrored link at -t
     values[missed] += misses[missed, None] * _LOG_CDF[_MIRRORED[link]](-t[missed])

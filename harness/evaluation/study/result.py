@@ -518,11 +518,11 @@ class StudyResult:
         precisions = [design.outcome for design in self.record.designs]
         conditions = ", ".join(filter(None, [conditions_of(self.facts, fewest), *precisions]))
         errors = [result.limit.record.threshold_error for result in self.set_ups]
-        known = [error for error in errors if error is not None]
-        if not known:
+        known_errors = [error for error in errors if error is not None]
+        if not known_errors:
             return conditions
-        low = min(error.low_per_m2 for error in known)
-        high = max(error.high_per_m2 for error in known)
+        low = min(error.low_per_m2 for error in known_errors)
+        high = max(error.high_per_m2 for error in known_errors)
         wanted = f"{self.record.false_calls_per_m2:g} false call"
         plural = "" if self.record.false_calls_per_m2 == 1 else "s"
         stated = f"threshold for {wanted}{plural} per m²"

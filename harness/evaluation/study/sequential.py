@@ -109,8 +109,8 @@ def _no_curve(without_curve: Sequence[SetUpLimit]) -> str:
     """Return why there is no curve."""
     first = without_curve[0]
     outcome = "all damages were found" if first.is_at_most else first.why
-    others = f" and {len(without_curve) - 1} more" if len(without_curve) > 1 else ""
-    return f"{first.record.label}{others} has no curve: {outcome}"
+    suffix = f" and {len(without_curve) - 1} more" if len(without_curve) > 1 else ""
+    return f"{first.record.label}{suffix} has no curve: {outcome}"
 
 
 def _batch_mm(design: BoardDesign, served: Sequence[SetUpLimit]) -> tuple[tuple[float, ...], ...]:

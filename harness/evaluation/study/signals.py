@@ -141,8 +141,8 @@ class SignalSizes:
         logs = np.array([line.fit.log_likelihood for line in self.lines])
         weight = np.exp(logs - logs.max())
         sizes = np.concatenate([line.quantiles(pod) for line in self.lines])
-        each = np.repeat(weight / weight.sum() / len(QUANTILES), len(QUANTILES))
-        return weighted_quantiles(sizes, each, shares)
+        quantile_weights = np.repeat(weight / weight.sum() / len(QUANTILES), len(QUANTILES))
+        return weighted_quantiles(sizes, quantile_weights, shares)
 
 
 def sizes_from_signals(record: SetUpRecord, hits: HitMissFit | None) -> SignalSizes:

@@ -37,16 +37,16 @@ def _sizes(holes: pd.DataFrame, case: str) -> list[Audited]:
         stated = holes[f"model_{name}_mm"].to_numpy(float)
         error = holes[f"model_{name}_se_mm"].to_numpy(float)
         true = holes[truth].to_numpy(float)
-        known = np.isfinite(stated) & np.isfinite(error) & np.isfinite(true)
-        if not known.any():
+        is_finite = np.isfinite(stated) & np.isfinite(error) & np.isfinite(true)
+        if not is_finite.any():
             continue
-        within = np.abs(stated - true)[known] <= WITHIN * error[known]
+        within = np.abs(stated - true)[is_finite] <= WITHIN * error[is_finite]
         row = audited(
             f"{name}, two standard errors",
             case,
             nominal=NOMINAL,
             holds=within,
-            ratio=stated[known] / true[known],
+            ratio=stated[is_finite] / true[is_finite],
         )
         rows.append(row)
     return rows

@@ -189,14 +189,14 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
         )
     size_mm = scored.size_mm[judged]
     score = scored.score[judged]
-    seen = Seen(
+    visibility = Seen(
         deviation_m=scored.seen.deviation_m[judged],
         cosine=scored.seen.cosine[judged],
         range_m=scored.seen.range_m[judged],
         residual_m=scored.seen.residual_m[judged],
     )
-    cosine = seen.cosine
-    design = _design(size_mm, cosine, seen.range_m)
+    cosine = visibility.cosine
+    design = _design(size_mm, cosine, visibility.range_m)
     below = np.isnan(score)
     found_scores = np.sort(score[score > threshold])
     lowest_scores = found_scores[np.isfinite(found_scores)][:FEWEST]
@@ -209,10 +209,10 @@ def findable(scored: ScoredDamage, threshold: float) -> Findable:
         """Return the log-likelihood of scores with a scatter proportional to cosine^-growth, and
         the fit to weighted rows."""
         weight = cosine**growth
-        signal_m = seen.signal_m(clipped, share)
+        signal_m = visibility.signal_m(clipped, share)
         fit = fit_censored(design * weight[:, None], np.log(signal_m) * weight, below, above)
         # the densities of ln signal in those of ln score, which all laws have in common
-        stretch = weight * clipped * seen.deviation_m / signal_m
+        stretch = weight * clipped * visibility.deviation_m / signal_m
         return fit.log_likelihood + float(np.log(stretch[exact]).sum()), fit
 
     laws = list(product(GROWTHS.tolist(), SHARES.tolist()))

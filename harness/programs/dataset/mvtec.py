@@ -53,8 +53,8 @@ class MvtecSet:
         self._samples: list[str] = []
         for split in (VALIDATION, "test"):
             for path in sorted(folder.glob(f"*/{split}/*/xyz/*.tiff")):
-                place = path.parent.parent.relative_to(folder).as_posix()
-                self._samples.append(f"{place}/{path.stem}")
+                folder_name = path.parent.parent.relative_to(folder).as_posix()
+                self._samples.append(f"{folder_name}/{path.stem}")
         if not self._samples:
             raise UserError(f"{folder}: has no <category>/test/<defect>/xyz/<number>.tiff")
         self._numbers = {name: number for number, name in enumerate(self._samples)}
@@ -113,8 +113,8 @@ class MvtecSet:
 
     def _file(self, name: str, kind: str, ending: str) -> Path:
         """Return a picture's file of a kind."""
-        place, _, number = name.rpartition("/")
-        return self.folder / place / kind / f"{number}{ending}"
+        folder_name, _, number = name.rpartition("/")
+        return self.folder / folder_name / kind / f"{number}{ending}"
 
     def _xyz_m(self, name: str) -> np.ndarray:
         """Return the points (h, w, 3) of a picture, NaN where missing."""

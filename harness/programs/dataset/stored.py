@@ -87,8 +87,8 @@ def refuse_odd_facts(file: Path, facts: Mapping[str, Any], form: type[StoredFact
         form.model_validate(facts)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        problem = f"{file}: {place[:100]}: {first['msg'].lower()}"
+        path_text = ".".join(str(part) for part in first["loc"])
+        problem = f"{file}: {path_text[:100]}: {first['msg'].lower()}"
         raise UserError(problem, legal="as tofpod dataset writes it", fix=AGAIN) from error
 
 

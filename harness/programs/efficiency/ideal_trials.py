@@ -106,7 +106,7 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
     x, y = np.moveaxis(set_up.board_xy_m, -1, 0)
     within_reach = [damage.within(x, y, reach_m) for damage in set_up.truth]
     signals_m = np.where(within_reach, clear_z_m - noise_free_z_m(undamaged), 0.0)
-    seen = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
+    is_judged = ndimage.binary_erosion(set_up.on_board, iterations=2) & np.isfinite(clear_z_m)
     inside = np.concatenate(list(set_up.outlines.values()))
     board = batch.board or 0
     names = tuple(str(damage.id) for damage in set_up.truth)
@@ -122,7 +122,7 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
         view = BoardView(
             board=board,
             holes=names,
-            known=seen[cut],
+            known=is_judged[cut],
             deviation_m=deviation_m[cut],
             signals_m=shown_signals_m,
             surface=shown_surface,

@@ -88,11 +88,11 @@ def costs_of(
     ``holes``, ``runs``: the study's tables of trials. Set-ups without a partner are left out."""
     without = {_place(limit): limit for limit in limits if limit.record.axes.get(AXIS) is None}
     costs = []
-    for place, unfiltered in without.items():
-        same_place = [limit for limit in limits if _place(limit) == place]
+    for set_up, unfiltered in without.items():
+        same_place = [limit for limit in limits if _place(limit) == set_up]
         same_place.sort(key=lambda limit: limit is not unfiltered)
         for limit in same_place:
-            costs.append(_cost(limit, unfiltered, place, holes, runs))
+            costs.append(_cost(limit, unfiltered, set_up, holes, runs))
     return costs
 
 
@@ -123,7 +123,7 @@ def _cost(
         with np.errstate(invalid="ignore"):  # infinity minus infinity is NaN: no evidence
             change_mm = limit.a90_mm - unfiltered.a90_mm
             change_interval_mm = percentiles(limit.a90_draws_mm - unfiltered.a90_draws_mm)
-    found = _found(limit)
+    found_size = _found(limit)
     found_without = _found(unfiltered)
     threshold = unfiltered.record.threshold
     quiet = _of_set_up(runs, limit)
@@ -135,8 +135,8 @@ def _cost(
         place=place,
         change_mm=change_mm,
         change_interval_mm=change_interval_mm,
-        lost=len(found_without - found),
-        gained=len(found - found_without),
+        lost=len(found_without - found_size),
+        gained=len(found_size - found_without),
         calling=_calling(quiet, threshold),
         calling_without=_calling(quiet_without, threshold),
         hole_free=int((quiet["role"] == "hole_free").sum()),

@@ -79,19 +79,19 @@ def _clause(cost: FilterCost) -> str:
 def changes_figure(costs: Sequence[FilterCost]) -> str:
     """Draw the change of a90 of each filter with its interval, one panel for each place."""
     filtered = [cost for cost in costs if cost.is_filtered]
-    places = list(dict.fromkeys(cost.place for cost in filtered))
+    set_ups = list(dict.fromkeys(cost.place for cost in filtered))
     widest_mm = max((_reach_mm(cost) for cost in filtered), default=1.0)
 
     def draw(drawing: Figure) -> None:
-        rows = [[cost for cost in filtered if cost.place == place] for place in places]
+        rows = [[cost for cost in filtered if cost.place == set_up] for set_up in set_ups]
         heights = [len(of_place) for of_place in rows]
-        panels = drawing.subplots(len(places), 1, squeeze=False, height_ratios=heights)
-        for axes, place, of_place in zip(panels[:, 0], places, rows, strict=True):
+        panels = drawing.subplots(len(set_ups), 1, squeeze=False, height_ratios=heights)
+        for axes, set_up, of_place in zip(panels[:, 0], set_ups, rows, strict=True):
             _draw_panel(axes, of_place, widest_mm)
-            axes.set_title(place, loc="left", fontsize=10)
+            axes.set_title(set_up, loc="left", fontsize=10)
         panels[-1, 0].set_xlabel("change of a90 against no filter (mm); right: larger holes only")
 
-    height_in = ROW_IN * len(filtered) + PANEL_IN * len(places)
+    height_in = ROW_IN * len(filtered) + PANEL_IN * len(set_ups)
     alt = " ".join(f"{_clause(cost)}." for cost in filtered)
     return svg("changes", (WIDTH_IN, height_in), alt, draw)
 

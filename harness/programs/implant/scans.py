@@ -138,9 +138,9 @@ class Scan:
         shown = self.judged
         candidates = choice_of(self.whole, AutoCrop()).candidates
         if candidates:
-            widest = max(candidates, key=lambda candidate: int((candidate.own & shown).sum()))
-            if (widest.own & shown).any():
-                shown = shown | widest.own
+            widest = max(candidates, key=lambda candidate: int((candidate.mask & shown).sum()))
+            if (widest.mask & shown).any():
+                shown = shown | widest.mask
         points_m = self.whole.points_m[shown & self.whole.valid]
         places_m = transform_points(invert(self.T_camera_board), points_m)[:, :2]
         low_m, high_m = np.quantile(places_m, (OUTLIERS, 1 - OUTLIERS), axis=0)

@@ -135,11 +135,11 @@ def _facts(kind: str, name: str) -> Row:
 def _facts_of_filter(name: str) -> Row:
     """Return the facts of a filter. Raises UserError if it cannot be used."""
     filter_settings_type(name)
-    about = inspect.getdoc(FILTERS.load(FILTERS.offer(name))) or ""
+    documentation = inspect.getdoc(FILTERS.load(FILTERS.offer(name))) or ""
     version = None
     with contextlib.suppress(UserError):  # not known without settings
         version = load_filter(name, {}).version
-    return {"version": version, "about": about.strip().partition("\n")[0]}
+    return {"version": version, "about": documentation.strip().partition("\n")[0]}
 
 
 def _declared_settings(kind: str, name: str) -> list[dict[str, Any]]:

@@ -181,8 +181,10 @@ def _list_artefacts(options: argparse.Namespace) -> int:
     cells = []
     for row in rows:
         older_than = row["older_than"]
-        more = len(older_than) - FIRST_PARTS
-        shown = ", ".join(older_than[:FIRST_PARTS]) + (f" and {more} more" if more > 0 else "")
+        unshown = len(older_than) - FIRST_PARTS
+        shown = ", ".join(older_than[:FIRST_PARTS])
+        if unshown > 0:
+            shown += f" and {unshown} more"
         facts = (row["made"], row["tofpod"], row["seconds"])
         cells.append(
             (row["name"], *("–" if fact is None else fact for fact in facts), shown or "–")

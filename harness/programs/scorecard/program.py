@@ -243,17 +243,17 @@ def _untested_lines(constants: power.UntestedConstants) -> list[str]:
     lines = []
     for camera, words_by_key in constants.items():
         hanging = []
-        others = []
+        unmoved = []
         for key, words in words_by_key.items():
             if words in ("none", power.NOT_MOVED_WORDS):
-                others.append(key)
+                unmoved.append(key)
             else:
                 hanging.append(f"{key} ({words})")
         parts = []
         if hanging:
             parts.append(f"limits hang on {', '.join(hanging)}")
-        if others:
-            parts.append(f"none seen to hang on {', '.join(others)}")
+        if unmoved:
+            parts.append(f"none seen to hang on {', '.join(unmoved)}")
         lines.append(f"{camera_title(camera)}: {'; '.join(parts)}")
     return lines
 

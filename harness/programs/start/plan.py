@@ -105,13 +105,13 @@ def commands(inquiry: Inquiry, file: Path) -> list[tuple[str, str]]:
     recording = shlex.quote(str(inquiry.recording))
     first = f"tofpod detect {recording} --tolerance width={inquiry.tolerance_mm:g}mm --out findings"
     second = f"{sweep} --quick"
-    told = "a first page of the simulated limit"
+    purpose = "a first page of the simulated limit"
     if inquiry.kind in IMPLANTED:
         second = _implant(inquiry, recording)
-        told = "the limit of your camera on this part, by virtual damage"
+        purpose = "the limit of your camera on this part, by virtual damage"
     return [
         (first, "the damage in the recording, and whether the part conforms"),
-        (second, told),
+        (second, purpose),
         (sweep, "the simulated limit with its interval"),
     ]
 

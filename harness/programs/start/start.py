@@ -58,10 +58,10 @@ def main(options: argparse.Namespace, command: str) -> int:
     file = name.answered(options.out, asks=asks)
     _write(file, experiment_text(inquiry, file.stem))
     print(f"wrote {file}\n")
-    three = commands(inquiry, file)
-    wide = max(len(words) for words, _ in three)
-    for words, told in three:
-        print(f"  {words:{wide}}  # {told}")
+    listed = commands(inquiry, file)
+    wide = max(len(words) for words, _ in listed)
+    for words, purpose in listed:
+        print(f"  {words:{wide}}  # {purpose}")
     return 0
 
 

@@ -78,11 +78,11 @@ def loss_of(log_odds: np.ndarray, example: Example) -> float:
 def gradient_of(network: Network, example: Example) -> tuple[float, list[np.ndarray]]:
     """Return the loss of an example, and its gradients in the order of `parameters_of`."""
     _, height, width = example.pictures.shape
-    seen = []
+    layer_inputs = []
     values = example.pictures
     for number, layer in enumerate(network.layers):
         columns = columns_of(values, layer.dilation_px)
-        seen.append(columns)
+        layer_inputs.append(columns)
         outputs = layer.weights.reshape(len(layer.weights), -1) @ columns
         outputs += layer.bias[:, None]
         if number < len(network.layers) - 1:
@@ -100,12 +100,12 @@ def gradient_of(network: Network, example: Example) -> tuple[float, list[np.ndar
         layer = network.layers[number]
         weights = layer.weights.reshape(len(layer.weights), -1)
         gradients.append(back.sum(axis=1))
-        gradients.append((back @ seen[number].T).reshape(layer.weights.shape))
+        gradients.append((back @ layer_inputs[number].T).reshape(layer.weights.shape))
         if number > 0:
             shape = (layer.weights.shape[1], height, width)
             inputs = _summed(weights.T @ back, shape, layer.dilation_px)
             # what the layer below cut off at 0 does not count; its middle taps are its outputs
-            middle = seen[number].reshape(shape[0], RINGS, -1)[:, 0]
+            middle = layer_inputs[number].reshape(shape[0], RINGS, -1)[:, 0]
             back = inputs.reshape(shape[0], -1) * (middle > 0)
     return loss, gradients[::-1]
 

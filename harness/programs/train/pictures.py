@@ -81,7 +81,7 @@ def labelled_picture(
     """Return the picture of a cloud with the truth."""
     picture = detector.picture(labelled.cloud)
     whitened = detector.whitened(*picture.residuals)
-    shape = whitened.known.shape
+    shape = whitened.is_known.shape
     damage = np.zeros(shape, bool)
     weights = np.ones(shape, np.float32)
     for flaw in labelled.truth:
@@ -90,8 +90,8 @@ def labelled_picture(
         damage.ravel()[cells] = True
         weights.ravel()[cells] = DAMAGE_PIXELS / max(len(cells), 1)
     weights[grown(damage, HALO_PX) & ~damage] = 0.0
-    weights[~whitened.known] = 0.0
-    return LabelledPicture(number, whitened.values, whitened.known, damage, weights)
+    weights[~whitened.is_known] = 0.0
+    return LabelledPicture(number, whitened.values, whitened.is_known, damage, weights)
 
 
 def prior_of(pictures: Sequence[LabelledPicture]) -> float:

@@ -126,14 +126,14 @@ def _pictures(plan: SweepPlan, engine: JobEngine) -> list[LabelledPicture]:
     jobs = []
     for number, board in enumerate(boards):
         jobs.append(Job(f"board {number}", "trials", pictures_of_board, (board,)))
-    made = {}
+    pictures_by_job = {}
     for job, ended in carried_out(jobs, engine):
         if ended.is_bug:
             raise RuntimeError(ended.why)
         if ended.state != "done":
             raise UserError(f"{job.name}: {ended.why.strip() or ended.state}")
-        made[job.name] = ended.value
-    pictures = [picture for job in jobs for picture in made[job.name]]
+        pictures_by_job[job.name] = ended.value
+    pictures = [picture for job in jobs for picture in pictures_by_job[job.name]]
     _say(f"{len(pictures)} pictures of {len(boards)} draws")
     return pictures
 
@@ -164,15 +164,15 @@ def _trained(
             loss, gradients = gradient_of(network, example_of(shown[index], sign))
             descent.step(gradients)
             total += loss
-        other = 0.0
+        held_out_loss = 0.0
         for picture in held_out:
             for sign in (1.0, -1.0):
                 example = example_of(picture, sign)
-                other += loss_of(network.log_odds(example.pictures), example)
+                held_out_loss += loss_of(network.log_odds(example.pictures), example)
         means = [total / len(shown)]
         text = f"pass {number + 1} of {passes}: loss {means[0]:.5f}"
         if held_out:
-            means.append(other / (2 * len(held_out)))
+            means.append(held_out_loss / (2 * len(held_out)))
             text += f", held out {means[1]:.5f}"
         losses.append(means)
         _say(text)

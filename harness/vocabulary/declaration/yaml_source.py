@@ -291,10 +291,10 @@ def parse_yaml(
             if context and mark and context.index != mark.index
             else None
         )
-        what = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
-        fix = next((fix for said, fix in INDENTATION.items() if said in what), None)
+        reason = " ".join(filter(None, [error.context, error.problem])).replace("\n", " ")
+        fix = next((fix for said, fix in INDENTATION.items() if said in reason), None)
         problem = Problem(
-            f"not valid YAML: {what}", where, fix=fix, other=begun, other_says="which began at"
+            f"not valid YAML: {reason}", where, fix=fix, other=begun, other_says="which began at"
         )
     except ReaderError as error:
         index = int(error.position)

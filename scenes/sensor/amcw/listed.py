@@ -93,11 +93,11 @@ def _strips(
     padded_numbers = np.pad(numbers, half, constant_values=beyond)
     # the columns of windows, run by run
     reached = cv2.dilate(padded.view(np.uint8), np.ones((1, side), np.uint8)).view(bool)
-    places = np.cumsum(reached).reshape(reached.shape) - 1
+    column_numbers = np.cumsum(reached).reshape(reached.shape) - 1
     width = padded.shape[1]
     upper = np.flatnonzero(reached) - half * width
     below = np.arange(side)[:, None] * width
-    return padded_numbers.ravel()[upper + below], places[padded] - half
+    return padded_numbers.ravel()[upper + below], column_numbers[padded] - half
 
 
 def decoded(

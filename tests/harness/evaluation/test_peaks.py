@@ -26,7 +26,7 @@ def true_rate(threshold: float) -> float:
 
 @pytest.mark.parametrize("shape", [-0.2, 0.0, 0.3])
 def test_scores_and_counts_of_a_tail_invert_each_other(shape: float) -> None:
-    tail = ScoreTail(place=16.0, log_scale=np.log(2.0), shape=shape, covariance=np.zeros((3, 3)))
+    tail = ScoreTail(location=16.0, log_scale=np.log(2.0), shape=shape, covariance=np.zeros((3, 3)))
     assert tail.score_at(1.0) == pytest.approx(4.0)
     for count in (0.05, 0.5, 3.0):
         score = tail.score_at(count)
