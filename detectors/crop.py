@@ -228,7 +228,7 @@ class _Border(NamedTuple):
     """Height of the step."""
 
 
-class _Comparison:
+class _OutlineComparison:
     """The surfaces of a cloud, compared by their outlines; they are numbered as in ``surfaces``."""
 
     def __init__(self, surfaces: Surfaces, grid: Cloud) -> None:
@@ -373,7 +373,7 @@ def _probability(odds_base: float) -> float:
 
 def _candidates(surfaces: Surfaces, grid: Cloud) -> tuple[tuple[Candidate, ...], list[str]]:
     """Return the candidates, best odds first, and warnings about taking the first."""
-    comparison = _Comparison(surfaces, grid)
+    comparison = _OutlineComparison(surfaces, grid)
     numbers = comparison.numbers
     odds = []
     for number in numbers:

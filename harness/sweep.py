@@ -4,7 +4,12 @@ report."""
 import argparse
 from pathlib import Path
 
-from harness.runs.options import add_engine_options, engine_options
+from harness.runs.options import (
+    add_engine_options,
+    add_overrides,
+    add_results_folder,
+    engine_options,
+)
 from harness.vocabulary.program import loading, program
 
 
@@ -15,11 +20,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod, such as averaging",
     )
-    help = (
-        "change a value of the file, such as repeats=5 or source.target.distance_m=90cm; may be "
-        "repeated"
-    )
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=help)
+    add_overrides(parser, "repeats=5 or source.target.distance_m=90cm")
     help = (
         "a recording (.mkv) whose own lens replaces the camera's nominal one, so that your unit "
         "is simulated"
@@ -30,13 +31,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "no sensitivity; wider intervals"
     )
     add("--quick", action="store_true", help=help)
-    add(
-        "--out",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="folder of results (default: results)",
-    )
+    add_results_folder(parser)
     add("--dry-run", action="store_true", help="validate and print what would be run; run nothing")
     add_engine_options(parser)
 

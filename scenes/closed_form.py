@@ -92,7 +92,7 @@ def image_view(
     )
 
 
-class _Hits(NamedTuple):
+class _RayEnds(NamedTuple):
     """Ends of rays (...) on a plane and the light from there."""
 
     points_m: np.ndarray
@@ -184,7 +184,7 @@ def _lit(
     plane: Plane,
     albedo: float,
     optics: Optics,
-) -> _Hits:
+) -> _RayEnds:
     """Return the ends on a plane of rays (..., 2) from the lens."""
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
     points = rays * plane.z_along_m(slopes)[..., None]
@@ -192,7 +192,7 @@ def _lit(
     leg_out = np.linalg.norm(to_emitter, axis=-1)
     light = albedo * np.clip(to_emitter @ plane.normal, 0, None) / leg_out**3
     path_m = leg_out + np.linalg.norm(points, axis=-1)
-    return _Hits(points, np.nan_to_num(light), np.nan_to_num(path_m))
+    return _RayEnds(points, np.nan_to_num(light), np.nan_to_num(path_m))
 
 
 def _view(

@@ -265,7 +265,8 @@ class _ReachedDisc:
         """Return (h, w) bool: which rays with these slopes (h, w, 2) meet it."""
         rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
         normal = self.axes[:, 2]
-        on_plane = rays * ((self.centre_m @ normal) / (rays @ normal))[..., None]
+        depth_m = (self.centre_m @ normal) / (rays @ normal)
+        on_plane = rays * depth_m[..., None]
         apart_m = np.linalg.norm(on_plane - self.centre_m, axis=-1)
         return np.asarray(apart_m < self.radius_m)
 

@@ -190,11 +190,13 @@ class Beams(Quadrilaterals):
 
     def lattice(self, count: int = FINE) -> np.ndarray:
         """Return weights (k, count) of sub-rays where a footprint meets an edge."""
+        # a sunflower spiral: turned by the golden angle, at even quantiles of a Gaussian's radius
         number = np.arange(count) + 0.5
         radius = self._deviation_rad * np.sqrt(-2 * np.log1p(-number / count))
         angle = np.pi * (3 - np.sqrt(5)) * number
         spiral = radius * np.stack([np.cos(angle), np.sin(angle)])
-        return np.concatenate([np.ones((1, count)), spiral - spiral.mean(axis=1, keepdims=True)])
+        centred = spiral - spiral.mean(axis=1, keepdims=True)
+        return np.concatenate([np.ones((1, count)), centred])
 
 
 @dataclass(frozen=True)

@@ -257,13 +257,15 @@ def _walk(views: HandHeldViews) -> tuple[tuple[float, ...], ...]:
     phases = rng.uniform(0, 2 * np.pi, (6, 3))
     cycles = rng.uniform(0.3, 1.5, (6, 3))
     time = np.linspace(0.0, 1.0, views.count) if views.count > 1 else np.zeros(1)
-    paths = np.sin(2 * np.pi * cycles[..., None] * time + phases[..., None]).sum(axis=1)
+    waves = np.sin(2 * np.pi * cycles[..., None] * time + phases[..., None])
+    paths = waves.sum(axis=1)
     paths -= paths[:, :1]
     greatest = np.maximum(np.abs(paths).max(axis=1, keepdims=True), 1e-12)
     reach = np.array([views.sway_deg] * 3 + [views.sway_mm] * 3)[:, None]
     # a hand rolls, and moves towards the target, less than it sways
     reach[[2, 5]] *= 0.5
-    return tuple(tuple(step) for step in (paths / greatest * reach).T.tolist())
+    motions = paths / greatest * reach
+    return tuple(tuple(step) for step in motions.T.tolist())
 
 
 def _moved(

@@ -199,8 +199,10 @@ def shared_places(cloud: Cloud, field: FlatField) -> np.ndarray:
     of_capture = _striking(before_m)
     of_rest = _striking(np.where(np.isfinite(error_m), before_m - error_m, np.nan))
     height = np.minimum(np.abs(of_field), np.abs(of_capture))
-    is_shared = (of_field * of_capture > 0) & (height > STANDS_OUT)
-    is_shared &= np.abs(of_rest) < np.abs(of_capture) / 2
+    is_same_sign = of_field * of_capture > 0
+    # the correction takes more than half of it away
+    is_corrected = np.abs(of_rest) < np.abs(of_capture) / 2
+    is_shared = is_same_sign & (height > STANDS_OUT) & is_corrected
     count, labels = cv2.connectedComponents(is_shared.astype(np.uint8))
     peaks = []
     for number in range(1, count):

@@ -224,7 +224,8 @@ def _averaged(residuals: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray,
     total = weights.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.nansum(weights * residuals, axis=0) / total
-        return mean, np.where(total > 0, 1 / total, np.nan)
+        variance = np.where(total > 0, 1 / total, np.nan)
+    return mean, variance
 
 
 def _disagreement_m2(

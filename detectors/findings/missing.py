@@ -447,7 +447,8 @@ def _tail(rate: float, sizes: np.ndarray, fields: int) -> _Chance:
     largest = sizes[-min(TAIL_CLUSTERS, len(sizes)) :]
     size = int(largest[0])
     number = int((sizes >= size).sum())
-    excess = float(sizes[-number:].mean() - size) * (1.0 + 2.0 / np.sqrt(number))
+    mean_excess = float(sizes[-number:].mean() - size)
+    excess = mean_excess * (1.0 + 2.0 / np.sqrt(number))
     # in a geometric distribution with mean excess m, the share m / (1 + m) continues to the next
     # size
     fall = float(np.log1p(1.0 / max(excess, 1e-9)))

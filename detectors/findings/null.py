@@ -278,7 +278,7 @@ def _count_reaching(share: float, expected: np.ndarray) -> float:
 
 
 def _laws(
-    peaks: _Peaks,
+    peaks: _FalsePeaks,
     judged: np.ndarray,
     marks: Marks,
     number: float,
@@ -506,14 +506,17 @@ class Tail:
     def of(cls, peaks: np.ndarray, floor: float, theory: float = NORMAL_PEAKS) -> Tail:
         """Weigh the exponents by the scores (n,) of the peaks above a floor, which is positive."""
         ratios = np.maximum(np.asarray(peaks, float) / floor, 1.0 + 1e-9)
-        excesses = [_excess(ratios, exponent, floor) for exponent in EXPONENTS]
-        sums = theory + np.array([excess.sum() for excess in excesses])
+        count = len(ratios)
+        excesses = [_excess(ratios, exponent, floor).sum() for exponent in EXPONENTS]
+        sums = theory + np.array(excesses)
         # the likelihood with the scale integrated out under its prior, a Gamma distribution
         slopes = ratios[:, None] ** (EXPONENTS - 1.0) - _crowd(floor) / ratios[:, None]
-        logs = np.log(slopes).sum(axis=0)
-        logs = logs - (len(ratios) + theory) * np.log(sums) + np.log(PRIOR)
-        weights = np.exp(logs - logs.max())
-        return cls(floor, len(ratios), sums, weights / weights.sum(), theory)
+        log_slopes = np.log(slopes).sum(axis=0)
+        log_likelihoods = log_slopes - (count + theory) * np.log(sums)
+        log_weights = log_likelihoods + np.log(PRIOR)
+        weights = np.exp(log_weights - log_weights.max())
+        weights = weights / weights.sum()
+        return cls(floor, count, sums, weights, theory)
 
     def _excesses(self, threshold: float) -> np.ndarray:
         """Return the excess (e,) of a threshold by each exponent."""
@@ -572,7 +575,7 @@ def _crowd(floor: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Peaks:
+class _FalsePeaks:
     """Findings in front of the surface, which are false calls."""
 
     floor: float
@@ -590,7 +593,7 @@ def _peaks(
     cloud: Cloud,
     before: Evidence,
     marks: Marks,
-) -> _Peaks:
+) -> _FalsePeaks:
     """Return the peaks in front of the surface.
 
     ``before``: evidence with scores in front of the surface only. Findings at small marks, and
@@ -598,7 +601,7 @@ def _peaks(
     evidence = _only(before, ~marks.covered)
     judged = evidence.score[np.isfinite(evidence.score)]
     if not (len(judged) and judged.max() > 0):
-        return _Peaks(1.0, np.zeros(0), np.zeros(0, bool), np.zeros(0))
+        return _FalsePeaks(1.0, np.zeros(0), np.zeros(0, bool), np.zeros(0))
     least = max(float(np.median(judged)), 1e-3 * float(judged.max()))
     steps = np.arange(np.log(judged.max() / least) / np.log(LADDER) + 1)
     thresholds = (least * LADDER**steps).tolist()
@@ -617,7 +620,7 @@ def _peaks(
             at_rim.append(rim[_peak_of(before, detection)])
         elif not proud[detection.pixels].any() and marks.hold(detection):
             scores_at_marks.append(detection.score)
-    return _Peaks(
+    return _FalsePeaks(
         floor=floor,
         scores=np.array(scores),
         is_at_rim=np.array(at_rim, bool),

@@ -125,9 +125,11 @@ def filters(covariance: np.ndarray, shape: tuple[int, ...]) -> Filters:
 def _packed_power(covariance: np.ndarray, grid: tuple[int, ...]) -> np.ndarray:
     """Return the power spectrum on a grid, packed as by `cv2.dft`."""
     power = cv2.dft(centred(covariance, grid))
-    # a real spectrum: the real factor of each number takes the imaginary one's place too
+    # a real spectrum: the real factor of each number takes the imaginary one's place too, which
+    # follows it in the row, but in the column at the two ends of the rows
+    ends = slice(None, None, grid[1] - 1)
     power[:, 2::2] = power[:, 1:-1:2]
-    power[2::2, :: grid[1] - 1] = power[1:-1:2, :: grid[1] - 1]
+    power[2::2, ends] = power[1:-1:2, ends]
     least = max(LEAST_POWER * float(covariance.max()), LEAST_VARIANCE)
     return np.maximum(power, np.float32(least))
 

@@ -30,9 +30,12 @@ def dense_covariance(known: np.ndarray, by_lag: np.ndarray) -> np.ndarray:
     """Return C (n, n) of the known pixels (r, c) bool, from a covariance by lag (odd, odd), lag 0
     in the middle, 0 beyond."""
     pixels = np.argwhere(known)
-    lags = pixels[:, None] - pixels + np.array(by_lag.shape) // 2
-    inside = ((lags >= 0) & (lags < by_lag.shape)).all(axis=-1)
-    return np.where(inside, by_lag[tuple(np.where(inside[..., None], lags, 0).T)].T, 0.0)
+    lag_0 = np.array(by_lag.shape) // 2
+    indices = pixels[:, None] - pixels + lag_0
+    is_known_lag = ((indices >= 0) & (indices < by_lag.shape)).all(axis=-1)
+    indices[~is_known_lag] = 0
+    values = by_lag[indices[..., 0], indices[..., 1]]
+    return np.where(is_known_lag, values, 0.0)
 
 
 def score(

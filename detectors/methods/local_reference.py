@@ -8,6 +8,7 @@ def tent_squares(image: np.ndarray, width: int) -> np.ndarray:
     along both axes; values beyond the edges count as 0."""
     box = np.ones(width)
     squares = np.convolve(box, box) ** 2
-    down = [np.convolve(column, squares)[width - 1 : 1 - width] for column in image.T]
-    across = [np.convolve(row, squares)[width - 1 : 1 - width] for row in np.transpose(down)]
+    same_size = slice(width - 1, 1 - width)
+    down = [np.convolve(column, squares)[same_size] for column in image.T]
+    across = [np.convolve(row, squares)[same_size] for row in np.transpose(down)]
     return np.array(across)

@@ -580,7 +580,7 @@ def _cores(
 # --- the scores of all templates ---
 
 
-class _View:
+class _SeenGrid:
     """The seen pixels, all or halved to every second one, as templates are compared with them.
 
     ``seen`` (r, c) float32: 1 where seen, a share where halved. ``depth_px`` (r, c): distance from
@@ -639,12 +639,12 @@ def _scored(
         start: (r, c), an approximate C^-1 r."""
     error = ROUGH if strong is None else whitening.CONVERGED
     solved = whitening.inverse_times(values, seen, noise.filters, start, error, noise.rim)
-    fine = _View(
+    fine = _SeenGrid(
         seen.astype(np.float32),
         outline_depth_px(seen),
         templates.transformed(solved, noise.filters.power.shape),
     )
-    coarse = _View(_halved(fine.seen), _halved(fine.depth_px), templates.halved(fine.spectrum))
+    coarse = _SeenGrid(_halved(fine.seen), _halved(fine.depth_px), templates.halved(fine.spectrum))
     zones = []
     if strong is not None:
         zones.append(zones_of(fine.seen, fine.depth_px, strong))
@@ -743,23 +743,25 @@ def _draw(best: _Best, slot: slots.BestSlot, number: int) -> None:
     columns = np.rint(slot.column + math.cos(angle_rad) * along).astype(int)
     height, width = best.signed.shape
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    on_grid = (rows[inside], columns[inside])
+    # just above the saddle at which peaks are joined
     scores = np.full(len(along), local.SADDLE * 1.01 * slot.score, np.float32)
     scores[len(along) // 2] = slot.score
-    on_grid = rows[inside], columns[inside]
     scores = scores[inside]
-    if np.abs(best.signed[on_grid]).max(initial=0.0) > abs(slot.score):
+    earlier = best.signed[on_grid]
+    if np.abs(earlier).max(initial=0.0) > abs(slot.score):
         return
-    stronger = np.abs(scores) > np.abs(best.signed[on_grid])
-    best.signed[on_grid] = np.where(stronger, scores, best.signed[on_grid])
+    stronger = np.abs(scores) > np.abs(earlier)
+    best.signed[on_grid] = np.where(stronger, scores, earlier)
     best.template[on_grid] = np.where(stronger, number, best.template[on_grid])
 
 
 def _responses(
-    fine: _View,
-    coarse: _View,
+    fine: _SeenGrid,
+    coarse: _SeenGrid,
     noise: _Noise,
     only_centred: bool,
-) -> Iterator[tuple[_View, int, np.ndarray]]:
+) -> Iterator[tuple[_SeenGrid, int, np.ndarray]]:
     """Yield for each template the view on which it is scored, its number, and its response t' C^-1
     r (r, c), which the next one overwrites."""
     bank = templates.bank(noise.window_px)

@@ -89,8 +89,10 @@ def rounding_left_m2(step_m: float, dither_m2: float) -> float:
     infinitely many frames. With noise of variance s^2 before it is (q / pi)^2 / 2 * sum_k exp(-4
     pi^2 k^2 s^2 / q^2) / k^2."""
     k = np.arange(1, 200)
-    terms = np.exp(-((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2) / k**2
+    exponents = -((2.0 * np.pi * k) ** 2) * dither_m2 / step_m**2
+    terms = np.exp(exponents) / k**2
     left_m2 = (step_m / np.pi) ** 2 / 2.0 * float(terms.sum())
+    # without noise, the variance of an even distribution over a step
     return min(left_m2, step_m**2 / 12.0)
 
 

@@ -199,7 +199,10 @@ def _colours(columns: dict[str, np.ndarray]) -> np.ndarray | None:
     if packed is not None and packed.dtype.itemsize == 4:
         # 0xRRGGBB, often declared as the floating-point number of the same bits
         codes = np.ascontiguousarray(packed).view(np.uint32)
-        return np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)
+        red = (codes >> 16) & 255
+        green = (codes >> 8) & 255
+        blue = codes & 255
+        return np.stack([red, green, blue], axis=-1).astype(np.uint8)
     if not {"red", "green", "blue"} <= set(columns):
         return None
     rgb = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
@@ -450,12 +453,17 @@ def _table(path: Path, content: bytes, skipped: int, line: str) -> np.ndarray:
 def _columns(path: Path, values: np.ndarray, line: str) -> dict[str, np.ndarray]:
     """Return columns by name: x, y, z, i, r, g, b. ``line`` precedes the numbers and may name
     them."""
-    bare = re.sub(r"\([^)]*\)|\[[^]]*\]", " ", line).strip(" #/\t\r,;").lower()
+    units = r"\([^)]*\)|\[[^]]*\]"
+    bare = re.sub(units, " ", line).strip(" #/\t\r,;").lower()
     names = [COLUMNS.get(word, "") for word in re.split(r"[,;\s]+", bare)]
     count = values.shape[1]
     if len(names) == count and set("xyz") <= set(names):
-        # the first of several columns of one name counts
-        return {name: values[:, i] for i, name in reversed(list(enumerate(names))) if name}
+        columns: dict[str, np.ndarray] = {}
+        for i, name in enumerate(names):
+            # the first of several columns of one name counts
+            if name and name not in columns:
+                columns[name] = values[:, i]
+        return columns
     if "z" in names:
         problem = f"{path}: names the columns {bare[:100]!r}, but its lines have {count} numbers"
         raise UserError(problem, legal=LEGAL_LIST)

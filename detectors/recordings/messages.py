@@ -128,15 +128,17 @@ def _rvl_numbers(content: bytes) -> np.ndarray:
     fourth bit says that another nibble follows."""
     count = (len(content) - RVL_HEADER_BYTES) // 4
     words = np.frombuffer(content, "<u4", count, RVL_HEADER_BYTES)
-    nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32) & 15).ravel()
+    nibble_shifts = np.arange(28, -1, -4, dtype=np.uint32)
+    nibbles = ((words[:, None] >> nibble_shifts) & 15).ravel()
     last = np.flatnonzero(nibbles < 8)
     if not last.size:
         return np.zeros(0, np.int64)
     first = np.concatenate([[0], last[:-1] + 1])
     digit = np.arange(last[-1] + 1) - np.repeat(first, last - first + 1)
     # no number of this stream has more than seven nibbles
-    parts = (nibbles[: digit.size] & 7).astype(np.int64) << 3 * np.minimum(digit, 10)
-    return np.add.reduceat(parts, first)
+    bit_shift = 3 * np.minimum(digit, 10)
+    bits = (nibbles[: digit.size] & 7).astype(np.int64)
+    return np.add.reduceat(bits << bit_shift, first)
 
 
 def frame_of_message(name: str, message: Any, scale_m: float) -> Frame:

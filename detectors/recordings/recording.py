@@ -189,5 +189,7 @@ def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
         return slopes
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
-    missed_px = np.abs(lens.project(rays) - np.stack([u, v], axis=-1)).max(axis=-1)
-    return np.where((missed_px < ROUND_TRIP_PX)[..., None], slopes, np.nan)
+    pixels = np.stack([u, v], axis=-1)
+    missed_px = np.abs(lens.project(rays) - pixels).max(axis=-1)
+    returns = missed_px < ROUND_TRIP_PX
+    return np.where(returns[..., None], slopes, np.nan)

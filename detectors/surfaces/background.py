@@ -24,8 +24,8 @@ from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
 from detectors.surfaces.surface import (
     BISQUARE_TUNING,
-    Fit,
     SurfaceConfig,
+    SurfaceFunction,
     along_rays,
     bisquare_weights,
     fit_surface,
@@ -128,7 +128,7 @@ class _Cells:
         within = median_of(self.noise[np.isfinite(self.noise)])
         return float(np.hypot(within, self.level_noise))
 
-    def refreshed(self, residuals: np.ndarray, fit: Fit) -> _Cells:
+    def refreshed(self, residuals: np.ndarray, fit: SurfaceFunction) -> _Cells:
         """Return the cells with medians and deviations of the points' residuals (n,); some cells
         are then dropped."""
         medians, deviations = group_medians(residuals, self.cell_of_point, len(self.points))
@@ -153,9 +153,9 @@ class _Shape(NamedTuple):
 
     name: str
     # fits this kind of surface to points (c, 3) with weights (c,)
-    fit_to: Callable[[np.ndarray, np.ndarray], Fit | None]
+    fit_to: Callable[[np.ndarray, np.ndarray], SurfaceFunction | None]
     # the fit to all cells
-    fit: Fit
+    fit: SurfaceFunction
     # the cells' robust weights (c,) in that fit
     weights: np.ndarray
     # shortest wave of a free form, in the picture's units
@@ -298,7 +298,7 @@ def _shape_of(
 
 
 def _profile(
-    points: np.ndarray, cells: _Cells, start: Fit, best: _Shape, rounding_m: float
+    points: np.ndarray, cells: _Cells, start: SurfaceFunction, best: _Shape, rounding_m: float
 ) -> Profile | None:
     """Return the extruded surface of points (n, 3), if it explains them better than the ``best``
     smooth shape; ``start`` is a surface of degree 2. ``rounding_m``: deviation that rounding
@@ -321,7 +321,9 @@ def _refined(points: np.ndarray, cells: _Cells, shape: _Shape) -> tuple[_Shape, 
     return shape, cells
 
 
-def _unseen(points: np.ndarray, cells: _Cells, fit: Fit, fitted: np.ndarray) -> np.ndarray:
+def _unseen(
+    points: np.ndarray, cells: _Cells, fit: SurfaceFunction, fitted: np.ndarray
+) -> np.ndarray:
     """Return which points (n, 3) have no surface (``fitted`` (n,) is NaN), or too steep a one."""
     unseen = ~np.isfinite(fitted)
     if cells.central:
@@ -362,7 +364,9 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
-def _stated(points: np.ndarray, config: SurfaceConfig, central: bool) -> tuple[str, Fit]:
+def _stated(
+    points: np.ndarray, config: SurfaceConfig, central: bool
+) -> tuple[str, SurfaceFunction]:
     """Return the name and the fit of a polynomial that is stated. ``central``: rays leave the
     origin, else along z."""
     surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
@@ -503,7 +507,9 @@ def _formulas(central: bool) -> list[tuple[str, Any]]:
     return formulas
 
 
-def _polynomial(points: np.ndarray, weights: np.ndarray, degree: int, central: bool) -> Fit:
+def _polynomial(
+    points: np.ndarray, weights: np.ndarray, degree: int, central: bool
+) -> SurfaceFunction:
     """Fit z(x, y) to points (c, 3). ``central``: rays leave the origin, else along z."""
     fit = polynomial(points, weights, degree)
     return along_rays(fit) if central else fit
@@ -595,7 +601,7 @@ def _simplest(errors: list[np.ndarray], worth: float) -> int:
     return best
 
 
-def _misfit(cells: _Cells, fit: Fit, name: str) -> tuple[str, dict[str, Any]]:
+def _misfit(cells: _Cells, fit: SurfaceFunction, name: str) -> tuple[str, dict[str, Any]]:
     """Return a warning if structure remains that could be mistaken for damage, else "", and its
     size."""
     error = cells.points[:, 2] - fit(cells.points)
@@ -659,7 +665,7 @@ def _block_sums(image: np.ndarray) -> np.ndarray:
     return np.asarray(sums)
 
 
-def _incidence_deg(points: np.ndarray, fit: Fit, step: float) -> np.ndarray:
+def _incidence_deg(points: np.ndarray, fit: SurfaceFunction, step: float) -> np.ndarray:
     """Return the angles (n,) between the rays and the surface's normals, from the surface's slope
     over one ``step``."""
 

@@ -112,17 +112,20 @@ def _placed(front: Triangles, sample: np.ndarray) -> Pose:
     """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
     thinned = sample[:: max(1, len(sample) // FEW)]
     starts = [_start(front, sample, turn) for turn in range(ROLLS)]
-    tried = [fitted(front, thinned, start) for start in starts]
-    return fitted(front, sample, starts[tried.index(closest_of(tried))])
+    poses = [fitted(front, thinned, start) for start in starts]
+    best = poses.index(closest_of(poses))
+    return fitted(front, sample, starts[best])
 
 
 def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:
     """Return T_part_camera (4, 4) of a part before the camera, rolled by quarters of a turn."""
     angle = turn * 2 * np.pi / ROLLS
-    c, s = np.rint([np.cos(angle), np.sin(angle)])
-    roll = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, :3] = roll @ T[:3, :3]
+    cosine = np.rint(np.cos(angle))
+    sine = np.rint(np.sin(angle))
+    roll = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    facing = np.diag([1.0, -1.0, -1.0])
+    T = np.eye(4)
+    T[:3, :3] = roll @ facing
     T[:3, 3] = front.middle_m - T[:3, :3] @ np.median(points, axis=0)
     return T
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from detectors.pixels.medians import group_medians
-from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
+from detectors.surfaces.surface import SurfaceFunction, bisquare_weights, polynomial
 
 SEARCHED = 8_000  # points from which a tilt and a twist are found
 TWIST_SEARCHED = 6_000  # points from which the frame of a twist is found
@@ -77,7 +77,7 @@ class Profile:
     """Whether rays leave the origin, else they run along z."""
     spread_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(k,): deviation of the surface's z at each knot, metres; empty until `with_spread`."""
-    twist: Fit | None = None
+    twist: SurfaceFunction | None = None
     """Distance ahead, metres, by which a polynomial moves the surface."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
@@ -228,7 +228,9 @@ def picked(points: np.ndarray, most: int) -> np.ndarray:
     return points[np.random.default_rng(0).integers(len(points), size=most)]
 
 
-def direction_of(points: np.ndarray, base: Fit, pitch: float, central: bool) -> Profile | None:
+def direction_of(
+    points: np.ndarray, base: SurfaceFunction, pitch: float, central: bool
+) -> Profile | None:
     """Return the profile, not yet fitted, along whose direction points (n, 3) depart least from a
     smooth surface ``base``; None if no direction stands out, or if the points lie in one place or
     in a plane through the camera.
@@ -328,12 +330,16 @@ def _block_means(
     columns = np.floor((across - across.min()) / side).astype(np.int64)
     rows = np.floor((along - along.min()) / side).astype(np.int64)
     width = int(columns.max()) + 1
-    keys = rows * width + columns
-    counts = np.bincount(keys)
-    used = counts >= max(1.0, 0.3 * float(np.median(counts[counts > 0])))
-    sums = np.bincount(keys, values)
+    block = rows * width + columns
+    counts = np.bincount(block)
+    sums = np.bincount(block, values)
+    # blocks at the rim hold few points
+    typical_count = float(np.median(counts[counts > 0]))
+    used = counts >= max(1.0, 0.3 * typical_count)
     row, column = np.divmod(np.flatnonzero(used), width)
-    return (column + 0.5) * side, (row + 0.5) * side, sums[used] / counts[used]
+    block_across = (column + 0.5) * side
+    block_along = (row + 0.5) * side
+    return block_across, block_along, sums[used] / counts[used]
 
 
 def _refined(
@@ -435,7 +441,7 @@ def _means_in_bands(
 
 
 def explains_better(
-    profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float = 0.0
+    profile: Profile, smooth: SurfaceFunction, points: np.ndarray, rounding_m: float = 0.0
 ) -> bool:
     """Return whether an extruded surface explains points (n, 3) better than a ``smooth`` one.
 
@@ -476,7 +482,7 @@ def explains_better(
 
 
 def profiled(
-    profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float
+    profile: Profile, smooth: SurfaceFunction, points: np.ndarray, rounding_m: float
 ) -> Profile | None:
     """Return the profile of `direction_of` fitted to points (n, 3), if it explains them better than
     a ``smooth`` surface. ``rounding_m``: deviation that rounding leaves."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from detectors.pixels.masks import grown, parts_with
 from detectors.surfaces.extruded import Profile, direction_of, picked, with_twist
-from detectors.surfaces.surface import Fit, polynomial
+from detectors.surfaces.surface import SurfaceFunction, polynomial
 
 SEARCHED = 40_000  # points of the area that are fitted
 CHORD_KNOTS = 6  # distance of the knots between which the profile's direction is taken
@@ -67,7 +67,7 @@ def _pitch(points_m: np.ndarray, central: bool) -> float:
     return float(np.median(steps[np.isfinite(steps)]))
 
 
-def _paraboloid(points: np.ndarray) -> Fit:
+def _paraboloid(points: np.ndarray) -> SurfaceFunction:
     return polynomial(points, np.ones(len(points)), degree=2)
 
 
@@ -76,7 +76,9 @@ def _held(profile: Profile, points: np.ndarray, near: np.ndarray) -> bool:
     knots = profile.knots(profile.slopes(points)).clip(0, len(profile.curve) - 1)
     strips = knots // CHORD_KNOTS
     counts = np.bincount(strips)
-    shares = np.bincount(strips, near)[counts > 0] / counts[counts > 0]
+    near_counts = np.bincount(strips, near)
+    occupied = counts > 0
+    shares = near_counts[occupied] / counts[occupied]
     return bool((shares >= HELD_OF_STRIP).mean() >= HELD_STRIPS)
 
 

@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.linalg import solveh_banded
 
 from detectors.pixels.clusters import PLAIN
-from detectors.surfaces.surface import RIDGE, Fit
+from detectors.surfaces.surface import RIDGE, SurfaceFunction
 
 KNOTS_PER_WAVELENGTH = 4.0
 """Cubic splines with knots at a quarter of the shortest wave that the penalty lets pass leave the
@@ -21,11 +21,11 @@ MOST_KNOTS = 64
 def free_form(
     points: np.ndarray,
     weights: np.ndarray,
-    base: Fit,
+    base: SurfaceFunction,
     wavelength: float,
     cell: float,
     central: bool,
-) -> Fit:
+) -> SurfaceFunction:
     """Fit a base shape plus tensor-product cubic B-splines in the picture's plane, penalised on
     third derivatives (Eilers and Marx 1996). Waves of ``wavelength`` pass by half, shorter ones
     less (as its sixth power); in units of x/z (central) or metres, as ``cell``, the spacing of the

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from detectors.pixels.masks import nearest_pixel
-from detectors.surfaces.surface import Fit, bisquare_weights, polynomial
+from detectors.surfaces.surface import SurfaceFunction, bisquare_weights, polynomial
 
 MOST_SAMPLES = 4000  # points from which a piece's surface is fitted
 HELD = 0.9  # share of a piece's points within the limit of a surface that holds it
@@ -69,7 +69,7 @@ def _sample(mask: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _fitted(points: np.ndarray) -> tuple[Fit, float]:
+def _fitted(points: np.ndarray) -> tuple[SurfaceFunction, float]:
     """Return the surface of degree 2 through points (n, 3), with little weight for those off it,
     and the cosine by which an error in depth exceeds the distance."""
     weights = np.ones(len(points))
@@ -83,7 +83,7 @@ def _fitted(points: np.ndarray) -> tuple[Fit, float]:
     return fit, abs(float(axes[2, 0]))
 
 
-def _holds(fit: Fit, cosine: float, points: np.ndarray, apart_m: float) -> bool:
+def _holds(fit: SurfaceFunction, cosine: float, points: np.ndarray, apart_m: float) -> bool:
     off_m = np.abs(points[:, 2] - fit(points)) * cosine
     return bool(len(points) and (off_m <= apart_m).mean() >= HELD)
 

@@ -234,7 +234,7 @@ def _starts(scan_m: np.ndarray, part_m: np.ndarray) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class _PlaneFrames:
     """Two frames on a part's plane, z to the camera: transforms from the camera's (4, 4)."""
 
     upright: np.ndarray
@@ -243,12 +243,12 @@ class _Frame:
     """x along the longest extent."""
 
 
-def _frame(points_m: np.ndarray) -> _Frame:
+def _frame(points_m: np.ndarray) -> _PlaneFrames:
     middle_m = np.median(points_m, axis=0)
     arms = points_m - points_m.mean(axis=0)
     _, axes = np.linalg.eigh(arms.T @ arms)
     normal = axes[:, 0] if axes[2, 0] < 0 else -axes[:, 0]
-    return _Frame(
+    return _PlaneFrames(
         upright=_facing(normal, np.array([1.0, 0.0, 0.0]), middle_m),
         principal=_facing(normal, axes[:, 2], middle_m),
     )

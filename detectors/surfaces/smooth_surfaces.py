@@ -560,4 +560,7 @@ def _is_filled(rows: np.ndarray, columns: np.ndarray) -> bool:
     occupied[rows, columns] = True
     in_block = occupied.reshape(down, 2, across, 2).sum(axis=(1, 3))
     inner = shrunk(np.pad(in_block > 0, 1), 3)[1:-1, 1:-1]
-    return not inner.any() or float(in_block[inner].mean()) / 4.0 >= CELLS_FILLED
+    if not inner.any():
+        return True
+    share_filled = float(in_block[inner].mean()) / 4.0
+    return share_filled >= CELLS_FILLED

@@ -518,7 +518,7 @@ def _concentrated(basis: np.ndarray, z: np.ndarray, c: np.ndarray, steps: int) -
     return np.asarray(c[order])
 
 
-Fit = Callable[[np.ndarray], np.ndarray]
+SurfaceFunction = Callable[[np.ndarray], np.ndarray]
 """Maps measured points (n, 3), metres, to the surface's z (n,), metres; NaN where a ray misses the
 surface."""
 RAY_STEP = 1e-4
@@ -530,7 +530,7 @@ the normal, where nothing is judged."""
 RIDGE = 1e-9
 
 
-def along_rays(fit: Fit) -> Fit:
+def along_rays(fit: SurfaceFunction) -> SurfaceFunction:
     """Return a ``fit`` of z at points' own x and y as one of z where the points' rays from the
     origin meet the surface: to first order in the distance between, exactly for planes. A point
     behind a tilted surface has another x and y than the place that its ray meets."""
@@ -546,7 +546,7 @@ def along_rays(fit: Fit) -> Fit:
     return z_at
 
 
-def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> Fit:
+def polynomial(points: np.ndarray, weights: np.ndarray, degree: int) -> SurfaceFunction:
     """Fit Chebyshev products of total degree ``degree`` by weighted least squares; regular for any
     points."""
     chebyshev = Chebyshev.over(points[:, :2], degree)
@@ -565,7 +565,7 @@ def _ridged(design: np.ndarray, z: np.ndarray, weights: np.ndarray) -> np.ndarra
     return np.asarray(np.linalg.solve(gram, weighted.T @ z))
 
 
-def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> Fit | None:
+def quadric(points: np.ndarray, weights: np.ndarray, central: bool) -> SurfaceFunction | None:
     """Fit the quadric with the least weighted squares along the rays, to first order: Taubin's
     algebraic fit (1991), then Gauss-Newton. None if it has no single sheet. ``central``: rays
     leave the origin, else along z."""
@@ -651,11 +651,15 @@ def _quadric_terms(places: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np
 
 def _taubin(terms: np.ndarray, slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the coefficients (10,) with the least sum of F^2 for a given sum of (dF/dray)^2."""
-    means = np.average(terms[:, :9], axis=0, weights=weights)
-    centred = terms[:, :9] - means
+    # the constant term, which has no slope, follows from the other nine
+    terms = terms[:, :9]
+    slopes = slopes[:, :9]
+    means = np.average(terms, axis=0, weights=weights)
+    centred = terms - means
     squares = centred.T @ (weights[:, None] * centred)
-    sloped = slopes[:, :9].T @ (weights[:, None] * slopes[:, :9])
+    sloped = slopes.T @ (weights[:, None] * slopes)
     sloped[np.diag_indices_from(sloped)] += 1e-6 * np.trace(sloped)
-    algebraic = eigh(squares, sloped, subset_by_index=(0, 0))[1][:, 0]
+    _, eigenvectors = eigh(squares, sloped, subset_by_index=(0, 0))
+    algebraic = eigenvectors[:, 0]
     c = np.append(algebraic, -means @ algebraic)
     return np.asarray(c / np.linalg.norm(c))

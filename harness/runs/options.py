@@ -3,6 +3,7 @@ limits."""
 
 import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 from harness.runs.jobs import Limits
 from harness.runs.shards import WHOLE, Shard
@@ -33,6 +34,29 @@ class EngineOptions:
     """Whether jobs that failed before are tried again."""
     cache_limit_gb: float | None = None
     """Size of all stored renders; None for no limit."""
+
+
+def add_overrides(parser: argparse.ArgumentParser, example: str) -> None:
+    """Add ``--set`` to a parser, as ``overrides``."""
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help=f"change a value of the file, such as {example}; may be repeated",
+    )
+
+
+def add_results_folder(parser: argparse.ArgumentParser) -> None:
+    """Add ``--out``, the folder of results, to a parser."""
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="folder of results (default: results)",
+    )
 
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:

@@ -81,7 +81,7 @@ def added(
     return [total + part for total, part in zip(totals, parts, strict=True)]
 
 
-class Hits(NamedTuple):
+class RayHits(NamedTuple):
     """Hits of n rays from the lens, float32."""
 
     range_m: np.ndarray
@@ -151,7 +151,7 @@ class DirectLight(NamedTuple):
     """The other sub-rays that met something."""
 
 
-def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
+def cast(lit: LitScene, slopes: np.ndarray) -> RayHits:
     """Cast rays from the lens along ``slopes`` (n, 2) = x/z, y/z."""
     mi = lit.mi
     dr = lit.dr
@@ -177,7 +177,7 @@ def cast(lit: LitScene, slopes: np.ndarray) -> Hits:
         met.normal,
     )
     # vectors one by one: to interleave them, Dr.Jit would compile a kernel for each number of rays
-    return Hits(
+    return RayHits(
         range_m=range_m.numpy(),
         path_m=path_m.numpy(),
         amplitude=amplitude.numpy(),
@@ -403,7 +403,8 @@ def _means(lanes: Any, by_lane: tuple[int, int]) -> np.ndarray:
     if isinstance(lanes, list):
         return np.stack([_means(array, by_lane) for array in lanes])
     sums = lanes.numpy().reshape(by_lane).sum(axis=1, dtype=float)
-    return np.asarray(sums / (by_lane[1] * A_LANE))
+    sub_rays = by_lane[1] * A_LANE
+    return np.asarray(sums / sub_rays)
 
 
 def _error_m(
@@ -525,7 +526,7 @@ def _corners(
     lit: LitScene,
     corner: np.ndarray,
     slopes: np.ndarray,
-    central: Hits,
+    central: RayHits,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return, (h, w) each, how far rays through a pixel's corners hit off the plane at its centre,
     and whether they show an edge or the edge of a shadow in the pixel.
@@ -563,7 +564,7 @@ def _corners(
     return bend_m, edge | (bend_m > KINK_M) | shadowed
 
 
-def _over_albedo(hits: Hits) -> np.ndarray:
+def _over_albedo(hits: RayHits) -> np.ndarray:
     """Return the light (n,) of hits on a surface of albedo 1; 0 where the albedo is 0."""
     nothing = np.zeros(len(hits.albedo))
     return np.divide(

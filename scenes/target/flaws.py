@@ -112,7 +112,8 @@ class _LongConfig(_FlawConfig):
         for k in range(3):
             waves.append(weights[k] * np.sin(2 * np.pi * ((k + 1) * share + turns[k])))
         line = np.sum(waves, axis=0)
-        line_m = self.wander_mm * MM * (line - line.mean()) / max(float(line.std()), 1e-12)
+        deviation = max(float(line.std()), 1e-12)
+        line_m = self.wander_mm * MM * (line - line.mean()) / deviation
         half_widths = np.linspace(-1.0, 1.0, ACROSS + 1)[:, None]
         across, s_m = np.broadcast_arrays(half_widths, share * self.length_mm * MM)
         t_m = line_m + across * self.width_mm * MM / 2
@@ -343,6 +344,8 @@ def from_line_m(line_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     piece = np.diff(line_m, axis=0)
     from_start = places_m[:, None] - line_m[:-1]
     square = np.maximum((piece**2).sum(axis=1), 1e-30)
-    share = np.clip((from_start * piece).sum(axis=-1) / square, 0.0, 1.0)
+    # the share of the piece at which its point closest to the place lies
+    projected = (from_start * piece).sum(axis=-1) / square
+    share = np.clip(projected, 0.0, 1.0)
     to_piece = from_start - share[..., None] * piece
     return np.asarray(np.linalg.norm(to_piece, axis=-1).min(axis=1))

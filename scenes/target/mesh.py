@@ -664,6 +664,7 @@ def _glb(target: Target) -> bytes:
 def _srgb_bytes(linear: np.ndarray) -> np.ndarray:
     """Return linear reflectance in 0..1 as 8-bit sRGB (IEC 61966-2-1)."""
     linear = np.asarray(linear, dtype=float)
-    bright = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, bright)
+    knee = 0.0031308
+    bright = 1.055 * np.maximum(linear, knee) ** (1 / 2.4) - 0.055
+    encoded = np.where(linear <= knee, 12.92 * linear, bright)
     return np.round(255 * encoded).astype(np.uint8)

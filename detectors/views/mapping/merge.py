@@ -106,8 +106,9 @@ def _undistorted(view: ChosenView) -> tuple[np.ndarray, np.ndarray | None, np.nd
     if cloud.rgb is not None:
         colours = raster.at_cells(cloud.rgb.reshape(-1, 3))
         rgb = (np.nan_to_num(colours) / 255.0).astype(np.float32)
-    u0, v0 = LOOKED_UP_AT - low / step
-    matrix = np.array([[1.0 / step, 0.0, u0], [0.0, 1.0 / step, v0], [0.0, 0.0, 1.0]])
+    focal_px = 1.0 / step
+    cx, cy = LOOKED_UP_AT - low / step
+    matrix = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
     return z.astype(np.float32)[..., None], rgb, matrix
 
 

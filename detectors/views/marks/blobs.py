@@ -319,19 +319,27 @@ def centroid_covariance_px2(polygon_px: np.ndarray) -> np.ndarray:
     steps = np.stack(np.meshgrid(np.arange(SHIFTS), np.arange(SHIFTS)), axis=-1)
     shift = (steps.reshape(-1, 2) + 0.5) / SHIFTS
     # polygons by shifts, then the lattice's rows, then edges
-    shifted = centred.reshape(-1, 1, 1, *centred.shape[-2:]) + shift[:, None, None]
+    vertices = centred.shape[-2]
+    shifted = centred.reshape(-1, 1, 1, vertices, 2) + shift[:, None, None]
     x, y = np.moveaxis(shifted, -1, 0)
+    edge_x = np.roll(x, -1, axis=-1) - x
+    edge_y = np.roll(y, -1, axis=-1) - y
     row = np.arange(np.floor(y.min()), np.ceil(y.max()) + 1)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        part = (row - y) / (np.roll(y, -1, axis=-1) - y)
-        crossing = x + part * (np.roll(x, -1, axis=-1) - x)
-        crossed = np.where((part >= 0) & (part <= 1), crossing, np.nan)
-    first = np.ceil(np.fmin.reduce(crossed, axis=-1))
-    last = np.floor(np.fmax.reduce(crossed, axis=-1))
+        along_edge = (row - y) / edge_y
+        crossing_x = x + along_edge * edge_x
+    is_crossed = (along_edge >= 0) & (along_edge <= 1)
+    crossing_x = np.where(is_crossed, crossing_x, np.nan)
+
+    # a row's lattice points lie between its two crossings
+    first = np.ceil(np.fmin.reduce(crossing_x, axis=-1))
+    last = np.floor(np.fmax.reduce(crossing_x, axis=-1))
     number = np.nan_to_num(np.maximum(last - first + 1, 0))
     sums_x = np.nan_to_num(number * (first + last) / 2)
-    sums = np.stack([sums_x, number * row[:, 0]], axis=-1).sum(axis=-2)
-    error = (sums / number.sum(axis=-1, keepdims=True) - shift).reshape(-1, 2)
+    sums_y = number * row[:, 0]
+    sums = np.stack([sums_x, sums_y], axis=-1).sum(axis=-2)
+    centroid = sums / number.sum(axis=-1, keepdims=True)
+    error = (centroid - shift).reshape(-1, 2)
     return np.asarray(error.T @ error / len(error))
 
 
@@ -363,10 +371,13 @@ def region_covariance_px2(pixels: np.ndarray) -> np.ndarray:
     return centroid_covariance_px2(((outline - middle) * sizes[:, None, None, :]) @ axes)
 
 
-def _area_and_centre(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed areas (...,) and centroids (..., 2) of polygons (..., n, 2)."""
-    following = np.roll(x, -1, axis=-2)
-    cross = x[..., 0] * following[..., 1] - x[..., 1] * following[..., 0]
+def _area_and_centre(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signed areas (...,) and centroids (..., 2) of polygons (..., n, 2), by the
+    shoelace formula."""
+    following = np.roll(vertices, -1, axis=-2)
+    x, y = np.moveaxis(vertices, -1, 0)
+    next_x, next_y = np.moveaxis(following, -1, 0)
+    cross = x * next_y - y * next_x
     area = cross.sum(axis=-1) / 2
-    moment = ((x + following) * cross[..., None]).sum(axis=-2)
+    moment = ((vertices + following) * cross[..., None]).sum(axis=-2)
     return area, moment / (6 * area[..., None])

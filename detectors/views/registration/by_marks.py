@@ -239,11 +239,15 @@ class JointState:
         x, y, z = points.T
         basis = self.basis(x, y)
         residual = z - basis @ (self.surface + self.view_terms[v])
+        # the surface's slopes by central differences
         dx, dy = 1e-3 * self.half_m
-        by_x = (self.basis(x + dx, y) - self.basis(x - dx, y)) @ self.surface / (2 * dx)
-        by_y = (self.basis(x, y + dy) - self.basis(x, y - dy)) @ self.surface / (2 * dy)
+        basis_change_x = self.basis(x + dx, y) - self.basis(x - dx, y)
+        basis_change_y = self.basis(x, y + dy) - self.basis(x, y - dy)
+        by_x = basis_change_x @ self.surface / (2 * dx)
+        by_y = basis_change_y @ self.surface / (2 * dy)
         normals = np.stack([-by_x, -by_y, np.ones(len(x))], axis=1)
-        by_pose = np.einsum("ni,nij->nj", normals, displacement_jacobian(points, np.zeros(3)))
+        displacements = displacement_jacobian(points, np.zeros(3))
+        by_pose = np.einsum("ni,nij->nj", normals, displacements)
         scale = max(data.noise_m, sigma_of(residual))
         tukey = np.clip(1 - (residual / scale / BISQUARE_TUNING) ** 2, 0.0, None) ** 2
         return residual, basis, by_pose, tukey / data.sigma_m**2

@@ -206,7 +206,8 @@ class _Side:
         """(n, 3): their centres."""
         self.normals = np.stack([mark.normal for mark in marks])
         """(n, 3): of the surface there."""
-        covariances = np.stack([mark.covariance_m2 for mark in marks]) + SHARED_M**2 * np.eye(3)
+        stated = np.stack([mark.covariance_m2 for mark in marks])
+        covariances = stated + SHARED_M**2 * np.eye(3)
         offsets = self.places[:, None] - self.places[None]
         self.distances = np.linalg.norm(offsets, axis=-1)
         """(n, n): between the marks."""
@@ -226,8 +227,10 @@ class _Side:
         normal -= (normal * along).sum(axis=-1, keepdims=True) * along
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         normal /= np.maximum(length, 1e-12)
-        axes = np.stack([along, np.cross(normal, along), normal], axis=-1)
-        return axes, (self.places[i] + self.places[j]) / 2
+        across = np.cross(normal, along)
+        axes = np.stack([along, across, normal], axis=-1)
+        middles = (self.places[i] + self.places[j]) / 2
+        return axes, middles
 
 
 Solution = tuple[tuple[int, ...], np.ndarray, float]
@@ -339,6 +342,7 @@ def _mutual(cost: np.ndarray) -> np.ndarray:
     -1."""
     column = cost.argmin(axis=2)
     row = cost.argmin(axis=1)
-    back = np.take_along_axis(row, column, axis=1) == np.arange(cost.shape[1])
-    finite = np.isfinite(np.take_along_axis(cost, column[..., None], axis=2)[..., 0])
-    return np.where(back & finite, column, -1)
+    row_back = np.take_along_axis(row, column, axis=1)
+    is_mutual = row_back == np.arange(cost.shape[1])
+    cheapest = np.take_along_axis(cost, column[..., None], axis=2)[..., 0]
+    return np.where(is_mutual & np.isfinite(cheapest), column, -1)

@@ -360,13 +360,13 @@ def _diagnostic_row(test: Diagnostic) -> tuple[str, float, str]:
     return f"{test.assumption} ({test.test})", test.p_value, f"{reading} at {LEVEL:.0%}"
 
 
-Fit = TypeVar("Fit", HitMissFit, AhatFit)
+PodFit = TypeVar("PodFit", HitMissFit, AhatFit)
 
 
 def _models(
-    tried: Sequence[Fit],
+    tried: Sequence[PodFit],
     bounds: Sequence[Bound],
-    close_fits: Sequence[Fit],
+    close_fits: Sequence[PodFit],
 ) -> tuple[ModelRow, ...]:
     """Return rows of fits with their ``bounds``; the first of the ``close_fits`` fits is that of
     the curve."""

@@ -57,7 +57,7 @@ class PodSurface:
         return link_cdf(self.link, self.b[0] + self.b[1] * a + self.b[2] * d + self.b[3] * a * d)
 
 
-class _Fit(NamedTuple):
+class _LinkFit(NamedTuple):
     """The likeliest surface of one link. ``b`` (4,): 0 for terms that were not fitted."""
 
     deviance: float
@@ -151,17 +151,17 @@ def _fit(
     link: str,
     design: np.ndarray,
     hit: np.ndarray,
-) -> _Fit:
+) -> _LinkFit:
     hits = hit.astype(float)
     b = _coefficients(design, hits[None], 1 - hits[None], link)[0]
     deviance = float(-2 * HitsAndMisses(design, hits, 1 - hits, link).value(b))
-    return _Fit(deviance, np.pad(b, (0, COEFFICIENTS - len(b))), link)
+    return _LinkFit(deviance, np.pad(b, (0, COEFFICIENTS - len(b))), link)
 
 
 def _refitted(
     design: np.ndarray,
     inspected: Inspected,
-    fit: _Fit,
+    fit: _LinkFit,
     draws: int,
 ) -> np.ndarray:
     """Return the coefficients (draws, 4) of resampled boards."""

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.runs.options import add_engine_options, engine_options
+from harness.runs.options import add_engine_options, add_results_folder, engine_options
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.program import program
@@ -25,13 +25,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help="cameras by name, or files of your own (default: all that come with tofpod)",
     )
-    add(
-        "--out",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="folder of results (default: results)",
-    )
+    add_results_folder(parser)
     add("--dry-run", action="store_true", help="list the shards with their bill; run nothing")
     add_engine_options(parser)
 

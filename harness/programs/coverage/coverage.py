@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.runs.options import add_overrides
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import MM
 from harness.vocabulary.lengths import in_unit
@@ -39,8 +40,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod: a study of drawn damage",
     )
-    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
+    add_overrides(parser, "source.target.distance_m=90cm")
     add("--detector", metavar="NAME", help="the only detector, of an experiment that compares some")
     pose = (
         "distance (bare: m) and tilts of the part about x and y in degrees, such as 0.7,20,-10; "

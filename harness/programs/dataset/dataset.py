@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.runs.engines import engine_of
 from harness.runs.jobs import Job, JobEngine, Outcome, StageCounts
-from harness.runs.options import EngineOptions
+from harness.runs.options import EngineOptions, add_overrides
 from harness.runs.shards import locked
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_text
@@ -33,8 +33,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file, or the name of one that comes with tofpod, with random boards",
     )
-    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
+    add_overrides(parser, "source.target.distance_m=90cm")
     add(
         "--boards",
         type=int,

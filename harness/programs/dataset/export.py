@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.runs.options import add_overrides
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import atomic_folder, write_json, write_text
 from harness.vocabulary.program import program, whole_number
@@ -33,8 +34,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="tum: one sequence; ros2 (sqlite3), mcap: one bag per view",
     )
     add("--out", required=True, type=Path, metavar="DIR", help="a new or empty folder")
-    change = "change a value of the file, such as source.target.distance_m=90cm; may be repeated"
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
+    add_overrides(parser, "source.target.distance_m=90cm")
     add(
         "--views",
         type=whole_number(10_000),

@@ -6,7 +6,12 @@ import argparse
 from pathlib import Path
 
 from harness.records.outputs import FILTERS_PAGE
-from harness.runs.options import add_engine_options, engine_options
+from harness.runs.options import (
+    add_engine_options,
+    add_overrides,
+    add_results_folder,
+    engine_options,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
 
@@ -33,22 +38,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a filter in place of the study's, such as median or one of your own package, or as "
         "YAML with settings: '{name: median, settings: {kernel_size: 3}}'; may be repeated",
     )
-    add(
-        "--set",
-        dest="overrides",
-        metavar="PATH=VALUE",
-        action="append",
-        default=[],
-        help="change a value of the file, such as detector.name=matched; may be repeated",
-    )
+    add_overrides(parser, "detector.name=matched")
     add("--quick", action="store_true", help="a first look: a third of the boards")
-    add(
-        "--out",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="folder of results (default: results)",
-    )
+    add_results_folder(parser)
     add_engine_options(parser)
 
 

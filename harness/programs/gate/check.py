@@ -27,7 +27,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.runs.options import add_engine_options, engine_options
+from harness.runs.options import (
+    add_engine_options,
+    add_overrides,
+    add_results_folder,
+    engine_options,
+)
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped, write_text
 from harness.vocabulary.program import program
@@ -36,9 +41,8 @@ if TYPE_CHECKING:
     from harness.evaluation.study.record import StudyRecord
     from harness.experiment.schema import Experiment
 
-BASELINES = shipped(
-    "baselines"
-)  # folder of the committed baselines, one ``<name of the experiment>.json`` each
+BASELINES = shipped("baselines")
+"""Folder of the committed baselines, one ``<name of the experiment>.json`` each."""
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -48,10 +52,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a YAML file with a `study`, such as experiments/regression.yaml",
     )
-    change = (
-        "change a value of the file, such as seed=7 for another draw of the noise; may be repeated"
-    )
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
+    add_overrides(parser, "seed=7 for another draw of the noise")
     add(
         "--baseline",
         type=Path,
@@ -59,13 +60,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="default: results/baselines/<name of the experiment>.json",
     )
     add("--update", action="store_true", help="write a new baseline, and print what changes")
-    add(
-        "--out",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="folder of results (default: results)",
-    )
+    add_results_folder(parser)
     add_engine_options(parser)
 
 
@@ -105,9 +100,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             fix="add --set study.precision=null",
         )
     needed = fewest_boards(set_ups)
-    if (
-        study.boards < needed
-    ):  # no loss could ever be significant, so the gate would pass everything
+    if study.boards < needed:
+        # no loss could ever be significant, so the gate would pass everything
         message = (
             f"with {study.boards} boards no loss is significant at {100 * ALPHA:g} %: the check "
             "cannot fail"
@@ -123,9 +117,8 @@ def main(options: argparse.Namespace, command: str) -> int:
             fix="run tofpod sweep in shards, merge, then check",
         )
     path = options.baseline or BASELINES / f"{experiment.config.name}.json"
-    baseline = _baseline(
-        path, update=options.update
-    )  # before anything runs, because a study takes minutes
+    # before anything runs, because a study takes minutes
+    baseline = _baseline(path, update=options.update)
     if baseline is not None:
         _state_age(baseline, experiment, path)
     code = run_study(experiment, options.out, engine, command)

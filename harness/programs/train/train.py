@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.runs.options import add_engine_options, engine_options
+from harness.runs.options import add_engine_options, add_overrides, engine_options
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
@@ -34,8 +34,7 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a YAML file, or the name of one that comes with tofpod, with random boards and a "
         "detector with a network",
     )
-    change = "change a value of the file, such as study.boards=20; may be repeated"
-    add("--set", dest="overrides", metavar="KEY=VALUE", action="append", default=[], help=change)
+    add_overrides(parser, "study.boards=20")
     add("--out", type=Path, required=True, metavar="FILE", help="the network's file, .npz")
     passes = "how often each picture is shown (default: 6)"
     add("--passes", type=whole_number(MOST_PASSES), default=6, metavar="N", help=passes)

@@ -99,13 +99,15 @@ def _integer_ratios(frequencies_hz: tuple[float, ...]) -> tuple[np.ndarray, floa
 def _wrap_counts(lattice: np.ndarray, noise_turns: float = 0.03) -> np.ndarray:
     """Return the wrap counts (n, f) that occur within the unambiguous range, also with errors of
     ``noise_turns``; those of the smallest errors last, as they take precedence."""
-    share = np.arange(0, 1, 1 / (64 * int(lattice.max()))) + 1e-9
+    finest_step = 1 / (64 * int(lattice.max()))
+    share = np.arange(0, 1, finest_step) + 1e-9
     turns = share[:, None] * lattice
     errors = list(product((-noise_turns, 0.0, noise_turns), repeat=lattice.size))
     errors.sort(key=lambda error: -sum(abs(turn) for turn in error))
     all_wraps = np.concatenate([np.floor(turns + np.array(error)) for error in errors])
     wraps = all_wraps.astype(np.int64)
-    return wraps[(wraps >= 0).all(axis=1) & (wraps < lattice).all(axis=1)]
+    in_range = (wraps >= 0).all(axis=1) & (wraps < lattice).all(axis=1)
+    return wraps[in_range]
 
 
 def _orthogonal_rows(lattice: np.ndarray, reach: int = 16) -> np.ndarray:

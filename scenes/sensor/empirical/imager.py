@@ -60,10 +60,12 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
         law = self.camera.noise
         ranges_mm = law.range_mm.value
         inside_m = np.clip(range_m, ranges_mm[0] * MM, ranges_mm[-1] * MM)
-        logs = np.interp(np.log(inside_m / MM), np.log(ranges_mm), np.log(law.sigma_mm.value))
+        # the law is a line through its points on doubly logarithmic paper
+        log_range = np.log(inside_m / MM)
+        log_sigma = np.interp(log_range, np.log(ranges_mm), np.log(law.sigma_mm.value))
         beyond = (range_m / inside_m) ** law.range_exponent.value
         by_brightness = brightness**-law.brightness_exponent.value
-        return np.asarray(MM * np.exp(logs) * beyond * by_brightness)
+        return np.asarray(MM * np.exp(log_sigma) * beyond * by_brightness)
 
     def expose(self, view: NoiseFreeView) -> IdealRange:
         """Return range, noise and probabilities of no return of a view that covers this region."""

@@ -167,7 +167,8 @@ class ScannedLidar(CameraFacts):
         deviation_s = self.code.correlation_fwhm_ns.value * NS / FWHM_PER_DEVIATION
         last_hz = np.sqrt(-2 * np.log(self.code.band_floor.value)) / (2 * np.pi * deviation_s)
         lines = np.arange(1, int(last_hz * self.period_s) + 1)
-        return np.asarray(np.exp(-0.5 * (2 * np.pi * lines / self.period_s * deviation_s) ** 2))
+        phases = 2 * np.pi * lines / self.period_s * deviation_s
+        return np.asarray(np.exp(-0.5 * phases**2))
 
     @cached_property
     def bandwidth_rad_s(self) -> float:

@@ -23,7 +23,7 @@ NEWTON_STEPS = 4
 NO_PEAK = -1e9  # height of a peak that does not exist
 
 
-class Peaks(NamedTuple):
+class CorrelationPeaks(NamedTuple):
     """The two strongest peaks of correlations, the stronger first."""
 
     delay: np.ndarray
@@ -34,7 +34,7 @@ class Peaks(NamedTuple):
     """(2, ...) float64: minus the second derivative by the angle 2 pi t / T."""
 
 
-def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
+def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> CorrelationPeaks:
     """Find peaks of correlations with phasors (K, ...) on lines 1..K of the comb and the pulse's
     ``weights`` (K,)."""
     lines = len(phasor)
@@ -52,7 +52,7 @@ def strongest_peaks(phasor: np.ndarray, weights: np.ndarray) -> Peaks:
     height = np.empty((2, len(spectrum)))
     curvature = np.empty((2, len(spectrum)))
     _peaks(spectrum @ waves, spectrum, delay, height, curvature)
-    return Peaks(
+    return CorrelationPeaks(
         delay=delay.reshape(2, *shape),
         height=height.reshape(2, *shape),
         curvature=curvature.reshape(2, *shape),

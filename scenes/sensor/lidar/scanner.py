@@ -301,5 +301,6 @@ def overlap_taps(points: float) -> np.ndarray:
     lags = np.arange(int(np.ceil(points)) if points > 1 else 1)
     correlation = np.zeros(FACTOR_ROWS)
     correlation[: len(lags)] = 1 - lags / max(points, 1.0)
-    taps = np.linalg.cholesky(linalg.toeplitz(correlation))[-1, -len(lags) :]
+    factor = np.linalg.cholesky(linalg.toeplitz(correlation))
+    taps = factor[-1, -len(lags) :]
     return np.asarray(taps / np.linalg.norm(taps))
