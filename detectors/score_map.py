@@ -10,7 +10,9 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 from pydantic import Field
 
-from detectors.findings.measure import HoleModelConfig, centres_of, measure_detection
+from detectors.findings.extents import centres_of
+from detectors.findings.measure import measure_detection
+from detectors.findings.surroundings import HoleModelConfig
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.levels import Findings as Findings
 from detectors.levels import above as above

@@ -130,7 +130,8 @@ def detect_options(parser: argparse.ArgumentParser) -> None:
 )
 def main(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
-    from harness.inspection.run import inspected, print_inspection, write_inspection
+    from harness.inspection.presentation import print_inspection, write_inspection
+    from harness.inspection.run import inspected
 
     run = inspected(arguments)
     print_inspection(run)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtri, ndtri_exp, owens_t
 
-from detectors.findings.measure import local_plane
+from detectors.findings.surroundings import local_plane
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from detectors.pixels.masks import grown, holes_filled, nearest_pixel, parts_with
 from harness.vocabulary.geometry import Cloud, Reason

@@ -2,12 +2,9 @@
 looks like damage.
 
 Damage lies behind the surface. Peaks in front of the surface are noise, fixed pattern or texture,
-after objects on the target (regions that stand before the surface as a whole; edges in the colour
-picture or the amplitude) and a margin are excluded. The tail of these peaks is extrapolated to the
-threshold at which the wanted number of false calls is expected, bumps and hole-like calls
-together. The tail is exponential in (s^q - 1) / q of the score s, minus the logarithm by which
-maxima of normal noise in two dimensions are more frequent. The data weigh the exponents q,
-starting from `PRIOR`; rates and scales are integrated out.
+after objects on the target (`detectors.findings.objects`) and a margin are excluded. The tail of
+these peaks is extrapolated to the threshold at which the wanted number of false calls is expected,
+bumps and hole-like calls together (`detectors.findings.tails`).
 
 Beside objects, print and edges false calls are more frequent, on both sides of the surface. The
 peaks in front of it there have a tail of their own, which predicts how many more calls that
@@ -18,42 +15,28 @@ do not explain those at the rim, these have a law of their own too, and scores a
 scaled down so that one threshold holds for both.
 
 Not modelled: noise that is asymmetric beyond what `skew_of` sees in the core; damage towards the
-camera that is no larger than the noise; objects on clouds without a grid, or that neither stand
-out nor are visible in a picture."""
+camera that is no larger than the noise."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
-import cv2
 import numpy as np
-from scipy import ndimage, special
+from scipy import special
 
-from detectors.findings.measure import extents
+from detectors.findings.objects import MOST_MASKED, Marks, marks_of
+from detectors.findings.tails import Tail, counts_of
 from detectors.interface import Detection, Detector, Evidence
 from detectors.levels import findings_at
-from detectors.pixels.masks import grown, holes_filled, parts_with
+from detectors.pixels.masks import holes_filled, rim_distance_px
 from harness.vocabulary.geometry import Cloud
 
-# --- the tail ---
+# --- tails ---
 
-EXPONENTS = np.array([3.0, 2.0, 1.5, 1.0, 0.5, 0.0])
-PRIOR = np.array([0.40, 0.45, 0.07, 0.04, 0.02, 0.02])
-"""Prior weights of exponents: averages of a camera's noise are near normal. From simulated boards
-of three cameras."""
-NORMAL_PEAKS = 10.0
-"""Weight of the theory, in peaks: maxima of normal noise with the deviation that a unit of score
-is meant to be. Ten peaks show that deviation to 16 %; robust scales of heavy-tailed noise err by
-as much."""
 THEORY_AT_MARKS = 1.0
-"""The same at marks: what print and edges make of the distance is no normal noise."""
-DRAWS = 4000  # of the interval
-TAIL_SHARE = 0.025  # probability of fewer false calls than its lower end; as much lies above
-HALVINGS = 48  # of the interval that holds a threshold: to rounding error
+"""Weight of the theory of normal noise at marks, in peaks (`NORMAL_PEAKS` elsewhere): what print
+and edges make of the distance is no normal noise."""
 CONTRADICTED = 0.1
 """A tail is rejected if the probability of the number of peaks above the threshold is lower."""
 
@@ -77,26 +60,8 @@ MOST_SKEW = 0.15
 """Difference of the quartiles' distances from the median, over their sum: 0.15 means 1.35 times as
 far on one side."""
 
-# --- objects on the target, and its rim ---
+# --- marks and the rim ---
 
-OBJECT_MARGIN_PX = 6
-"""Margin around an object: its edge is mixed over 3 pixels, and its shadow lies beside it."""
-PATCH_PX = 5  # side of the square that smooths residual and picture
-LEAST_OBJECT_PX = 100  # least pixels of an object: four such squares
-PROUD = 6.0
-"""Smoothed residual in front of the surface at an object's highest point, in deviations."""
-PROUD_FOOT = 3.0  # the same everywhere on it
-MARKED = 8.0
-"""Slope of an edge in the picture, in multiples of the median slope: a tag, print, another
-material."""
-MOST_MASKED = 0.5
-"""Largest share of the judged area under objects: the rest must represent the whole."""
-LONGEST_HOLE_PX = 35
-"""A longer mark is more than a hole as the picture shows it: the widest filters judge 25 pixels,
-and the squares that smooth the picture twice widen its edges by 10."""
-OWN_SHARE = 0.5
-"""A longer mark is still the finding itself if this share of it lies within the finding and its
-margin."""
 PLAIN = "plain"
 """Name of the law of noise away from long marks."""
 MARKS = "at marks"
@@ -217,66 +182,6 @@ def own_threshold(
     )
 
 
-def calls_at(tails: Mapping[str, Tail], threshold: float) -> float:
-    """Return the number of false calls that all laws together expect above a threshold, on both
-    sides of the surface."""
-    return 2.0 * sum(tail.expected(threshold) for tail in tails.values())
-
-
-def threshold_at(tails: Mapping[str, Tail], calls: float, least: float) -> float:
-    """Return the threshold, at least ``least``, above which all laws together expect so many false
-    calls (above 0), on both sides of the surface."""
-    if calls_at(tails, least) <= calls:
-        return least
-    return _falls_to(calls, lambda threshold: calls_at(tails, threshold), least)
-
-
-def _falls_to(number: float, expected: Callable[[float], float], least: float) -> float:
-    """Return the threshold above ``least`` (above 0) at which a falling expectation is this
-    number."""
-    low = least
-    high = 2.0 * least
-    while expected(high) > number:
-        low = high
-        high *= 2.0
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        if expected(middle) > number:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-def counts_of(tails: Mapping[str, Tail], threshold: float) -> tuple[float, float]:
-    """Return the fewest and the most false calls of the central 95 % of their number above a
-    threshold, on both sides of the surface and by all laws together.
-
-    The number is Poisson, with the expectation of each of `DRAWS` laws that the peaks allow. So it
-    contains that the law is uncertain and that calls come by chance."""
-    expected = np.zeros(DRAWS)
-    for tail in tails.values():
-        expected += 2.0 * tail.laws(DRAWS).expected(threshold)
-    return _count_reaching(TAIL_SHARE, expected), _count_reaching(1.0 - TAIL_SHARE, expected)
-
-
-def _count_reaching(share: float, expected: np.ndarray) -> float:
-    """Return the smallest count that a Poisson number, with one of equally likely expectations
-    (k,), does not exceed with a probability of at least ``share``."""
-    low = -1
-    high = 1
-    while special.pdtr(high, expected).mean() < share:
-        low = high
-        high *= 2
-    while high - low > 1:
-        middle = (low + high) // 2
-        if special.pdtr(middle, expected).mean() < share:
-            low = middle
-        else:
-            high = middle
-    return float(high)
-
-
 def _laws(
     peaks: _FalsePeaks,
     judged: np.ndarray,
@@ -320,7 +225,7 @@ def _laws(
 
 def _rim_of(judged: np.ndarray) -> np.ndarray:
     """Return (h, w) bool: the pixels along the rim of the judged ones, (h, w) bool."""
-    return _depth_px(holes_filled(judged)) <= RIM_PX
+    return rim_distance_px(holes_filled(judged)) <= RIM_PX
 
 
 def is_at_rim(evidence: Evidence, detection: Detection) -> bool:
@@ -341,7 +246,7 @@ def with_rim_scaled(evidence: Evidence, scale: float) -> Evidence:
     as far from it: a finding at the rim, as wide as the widest filters, is not cut in two."""
     if scale == 1.0:
         return evidence
-    depth_px = _depth_px(holes_filled(np.isfinite(evidence.residual_m)))
+    depth_px = rim_distance_px(holes_filled(np.isfinite(evidence.residual_m)))
     nearness = np.clip(2.0 - depth_px / RIM_PX, 0.0, 1.0)
     return replace(evidence, score=evidence.score * scale**nearness)
 
@@ -411,167 +316,7 @@ def _doubts_about_symmetry(evidence: Evidence) -> list[str]:
     ]
 
 
-# --- the tail of the peaks ---
-
-
-@dataclass(frozen=True)
-class Laws:
-    """Laws that the peaks allow, drawn at random, each with one exponent."""
-
-    floor: float
-    """Units of score."""
-    exponents: np.ndarray
-    """(k,)."""
-    numbers: np.ndarray
-    """(k,): expected number of calls above the floor."""
-    rates: np.ndarray
-    """(k,): by which the logarithm of the number falls with the excess."""
-    scale: float
-    """Scores in the evidence over those of the law."""
-
-    def expected(self, threshold: float) -> np.ndarray:
-        """Return the expected number (k,) of calls above a threshold."""
-        ratio = np.array([threshold / (self.scale * self.floor)])
-        excesses = np.zeros(len(self.numbers))
-        for exponent in EXPONENTS:
-            excesses[self.exponents == exponent] = _excess(ratio, exponent, self.floor)[0]
-        return self.numbers * np.exp(-self.rates * excesses)
-
-    def densities(self, scores: np.ndarray) -> np.ndarray:
-        """Return the expected number (k, n) of calls per unit of score, at scores (n,) above the
-        floor."""
-        floor = self.scale * self.floor
-        ratios = scores / floor
-        falls = np.zeros((len(self.numbers), len(scores)))
-        for exponent in EXPONENTS:
-            excess = _excess(ratios, exponent, self.floor)
-            slope = self.floor * (ratios ** (exponent - 1.0) - _crowd(self.floor) / ratios)
-            chosen = self.exponents == exponent
-            rates = self.rates[chosen, None]
-            falls[chosen] = rates * slope / self.scale * np.exp(-rates * excess)
-        return self.numbers[:, None] * falls
-
-
-@dataclass(frozen=True)
-class Tail:
-    """The law by which noise exceeds a threshold, from its peaks above a floor."""
-
-    floor: float
-    """Units of score."""
-    peaks: int
-    """Number of peaks above it."""
-    sums: np.ndarray
-    """(e,): for each exponent, the sum of the peaks' transformed excesses, and the theory's."""
-    weights: np.ndarray
-    """(e,): of the exponents, which sum to 1."""
-    theory: float = NORMAL_PEAKS
-    """Weight of the theory of normal noise, in peaks."""
-    area_ratio: float = 1.0
-    """Area where calls are expected, over the area of the peaks."""
-    scale: float = 1.0
-    """Scores in the evidence over those of the peaks."""
-
-    @property
-    def number(self) -> float:
-        """Expected number of calls above the floor; that of half a peak if there is none."""
-        return max(self.peaks, 0.5) * self.area_ratio
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        return {
-            "floor": self.floor,
-            "peaks": self.peaks,
-            "sums": self.sums.tolist(),
-            "weights": self.weights.tolist(),
-            "theory": self.theory,
-            "area_ratio": self.area_ratio,
-            "scale": self.scale,
-        }
-
-    @classmethod
-    def from_facts(cls, facts: Mapping[str, Any]) -> Tail:
-        """Return the tail with these `facts`."""
-        return cls(
-            floor=facts["floor"],
-            peaks=facts["peaks"],
-            sums=np.array(facts["sums"]),
-            weights=np.array(facts["weights"]),
-            theory=facts["theory"],
-            area_ratio=facts["area_ratio"],
-            scale=facts["scale"],
-        )
-
-    @classmethod
-    def of(cls, peaks: np.ndarray, floor: float, theory: float = NORMAL_PEAKS) -> Tail:
-        """Weigh the exponents by the scores (n,) of the peaks above a floor, which is positive."""
-        ratios = np.maximum(np.asarray(peaks, float) / floor, 1.0 + 1e-9)
-        count = len(ratios)
-        excesses = [_excess(ratios, exponent, floor).sum() for exponent in EXPONENTS]
-        sums = theory + np.array(excesses)
-        # the likelihood with the scale integrated out under its prior, a Gamma distribution
-        slopes = ratios[:, None] ** (EXPONENTS - 1.0) - _crowd(floor) / ratios[:, None]
-        log_slopes = np.log(slopes).sum(axis=0)
-        log_likelihoods = log_slopes - (count + theory) * np.log(sums)
-        log_weights = log_likelihoods + np.log(PRIOR)
-        weights = np.exp(log_weights - log_weights.max())
-        weights = weights / weights.sum()
-        return cls(floor, count, sums, weights, theory)
-
-    def _excesses(self, threshold: float) -> np.ndarray:
-        """Return the excess (e,) of a threshold by each exponent."""
-        ratio = np.array([threshold / (self.scale * self.floor)])
-        return np.array([float(_excess(ratio, exponent, self.floor)[0]) for exponent in EXPONENTS])
-
-    def expected(self, threshold: float) -> float:
-        """Return the mean number of peaks above a threshold, over all rates and scales that the
-        peaks allow."""
-        beyond = 1.0 + self._excesses(threshold) / self.sums
-        shares = beyond ** -(self.peaks + self.theory)
-        return float((self.weights * self.number * shares).sum())
-
-    def threshold(self, number: float) -> float:
-        """Return the threshold at which this number of peaks is expected; the floor if fewer are
-        expected there."""
-        floor = self.scale * self.floor
-        if number >= self.number:
-            return floor
-
-        return _falls_to(number, self.expected, floor)
-
-    def laws(self, count: int) -> Laws:
-        """Draw ``count`` laws that the peaks allow, the same ones every time."""
-        random = np.random.default_rng(20201102)
-        chosen = random.choice(len(EXPONENTS), count, p=self.weights)
-        steepness = random.gamma(self.peaks + self.theory, 1.0, count)
-        numbers = self.area_ratio * random.gamma(max(self.peaks, 0.5), 1.0, count)
-        return Laws(
-            floor=self.floor,
-            exponents=EXPONENTS[chosen],
-            numbers=numbers,
-            rates=steepness / self.sums[chosen],
-            scale=self.scale,
-        )
-
-
-def _excess(
-    ratios: np.ndarray,
-    exponent: float,
-    floor: float,
-) -> np.ndarray:
-    """Return how far scores, as ratios (n,) to the floor, lie above it, in factors of e by which
-    peaks become fewer.
-
-    The exponent 2 is that of normal noise, whose maxima in two dimensions fall as s exp(-s^2 / 2)
-    (Adler 1981)."""
-    power = np.log(ratios) if exponent == 0.0 else (ratios**exponent - 1.0) / exponent
-    return floor**2 * (power - _crowd(floor) * np.log(ratios))
-
-
-def _crowd(floor: float) -> float:
-    """Return the logarithmic part of the excess; at most half of it for low floors, where that law
-    does not hold."""
-    return min(floor**-2.0, 0.5)
+# --- the peaks ---
 
 
 @dataclass(frozen=True)
@@ -672,175 +417,6 @@ def _floor_among(counts: list[int]) -> int:
     return free[0] if free else crowd
 
 
-# --- objects on the target, print and edges ---
-
-
-@dataclass(frozen=True)
-class Marks:
-    """Objects, print and edges in the picture, where false calls are more frequent."""
-
-    proud: np.ndarray
-    """(h, w) bool: objects that stand before the surface."""
-    covered: np.ndarray
-    """(h, w) bool: objects and edges of the picture, with their margin."""
-    labels: np.ndarray
-    """(h, w): number of the object or edge that is longer than a hole, without margin; 0 elsewhere.
-    """
-    areas: np.ndarray
-    """(n + 1,): number of pixels with each number."""
-    margin_px: int
-    """Distance in pixels up to which a finding is at a mark."""
-
-    @property
-    def count(self) -> int:
-        """Number of long marks."""
-        return len(self.areas) - 1
-
-    @cached_property
-    def regions(self) -> int:
-        """Number of connected regions that are covered."""
-        return int(ndimage.label(self.covered)[1])
-
-    @cached_property
-    def beside_long(self) -> np.ndarray:
-        """(h, w) bool: long marks, with their margin."""
-        return grown(self.labels > 0, self.margin_px, cv2.MORPH_ELLIPSE)
-
-    def hold(self, detection: Detection) -> bool:
-        """Return whether a finding is at a long mark, most of which lies beyond the finding."""
-        if not self.count:
-            return False
-        height, width = self.labels.shape
-        rows, columns = np.unravel_index(detection.pixels, self.labels.shape)
-        margin = self.margin_px
-        top = max(int(rows.min()) - margin, 0)
-        left = max(int(columns.min()) - margin, 0)
-        bottom = min(int(rows.max()) + margin + 1, height)
-        right = min(int(columns.max()) + margin + 1, width)
-        inside = np.zeros((bottom - top, right - left), bool)
-        inside[rows - top, columns - left] = True
-        labels_nearby = self.labels[top:bottom, left:right][
-            grown(inside, margin, cv2.MORPH_ELLIPSE)
-        ]
-        counts = np.bincount(labels_nearby, minlength=len(self.areas))[1:]
-        return bool(((counts > 0) & (counts < OWN_SHARE * self.areas[1:])).any())
-
-
-def marks_of(cloud: Cloud, evidence: Evidence) -> Marks:
-    """Return the objects, print and edges of a cloud; none without a pixel grid.
-
-    A cloud keeps them by the pixels that are judged and by their residuals, which detectors
-    share."""
-    digest = hashlib.blake2b(np.isfinite(evidence.score).tobytes())
-    digest.update(evidence.residual_m.tobytes())
-    key = digest.digest()
-    if key not in cloud.marks:
-        cloud.marks[key] = _marks(cloud, evidence)
-    return cloud.marks[key]
-
-
-def _marks(cloud: Cloud, evidence: Evidence) -> Marks:
-    """Find the `marks_of` a cloud."""
-    shape = evidence.score.shape
-    nowhere = np.zeros(shape, bool)
-    margin_px = _margin(cloud)
-    if not cloud.organised:
-        labels = np.zeros(shape, np.int32)
-        return Marks(nowhere, nowhere, labels, np.array([nowhere.size]), margin_px)
-    proud = _proud(cloud, evidence)
-    objects = proud | _marked(cloud, evidence)
-    covered = grown(objects, margin_px, cv2.MORPH_ELLIPSE)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(objects.astype(np.uint8))
-    longer = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
-    is_long = longer > LONGEST_HOLE_PX
-    is_long[0] = False
-    number = np.cumsum(is_long) * is_long
-    labels = number[labels]
-    areas = np.bincount(labels.ravel(), minlength=int(is_long.sum()) + 1)
-    return Marks(proud, covered, labels, areas, margin_px)
-
-
-def each_object_once(
-    cloud: Cloud,
-    evidence: Evidence,
-    found: tuple[Detection, ...],
-) -> tuple[Detection, ...]:
-    """Return the findings, strongest first, with each object on the target as one finding:
-    findings that reach its margin and are weaker belong to it.
-
-    An object with a single finding keeps it. Nothing is joined without a pixel grid, or if objects
-    would cover more than `MOST_MASKED`."""
-    if not cloud.organised or not found:
-        return found
-    proud = _proud(cloud, evidence)
-    judged = np.isfinite(evidence.score)
-    if (proud & judged).sum() > MOST_MASKED * judged.sum():
-        return found
-    labels, count = ndimage.label(proud, np.ones((3, 3)))
-    kept = list(found)
-    for number in range(1, count + 1):
-        region = labels == number
-        flat = region.ravel()
-        margin = grown(region, _margin(cloud), cv2.MORPH_ELLIPSE).ravel()
-        scores = [detection.score for detection in kept if flat[detection.pixels].any()]
-        height = max(scores, default=0.0)
-        separate = [
-            detection
-            for detection in kept
-            if detection.score > height or not margin[detection.pixels].any()
-        ]
-        if len(kept) - len(separate) >= 2:
-            pixels = np.flatnonzero(region & cloud.valid)
-            centre_m = extents(cloud.points_m.reshape(-1, 3)[pixels])[1]
-            kept = [*separate, Detection(height, pixels, centre_m, "object")]
-    return tuple(sorted(kept, key=lambda detection: -detection.score))
-
-
-def _margin(cloud: Cloud) -> int:
-    """Return the margin around objects in pixels: the reach of noise blurs them farther."""
-    return OBJECT_MARGIN_PX + int(np.ceil(cloud.noise_reach_px / 2))
-
-
-def _proud(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: connected regions, wider than noise, that are in front of the surface as
-    a whole."""
-    judged = np.isfinite(evidence.residual_m)
-    weights = _boxed(judged.astype(np.float64))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        smooth = _boxed(np.where(judged, evidence.residual_m, 0.0)) / weights
-    smooth[~judged | (weights < 0.5)] = np.nan
-    if not np.isfinite(smooth).any():
-        return np.zeros_like(judged)
-    before = np.nanmedian(smooth) - smooth
-    spread = 1.4826 * np.nanmedian(np.abs(before))
-    before /= max(spread, cloud.z_step_m / PATCH_PX, 1e-9)
-    return parts_with(before > PROUD_FOOT, before > PROUD, least=LEAST_OBJECT_PX)
-
-
-def _marked(cloud: Cloud, evidence: Evidence) -> np.ndarray:
-    """Return (h, w) bool: long steep edges of the colour picture or the amplitude."""
-    inside = _depth_px(holes_filled(np.isfinite(evidence.score))) > 2 * PATCH_PX
-    edges = np.zeros(cloud.valid.shape, bool)
-    channels: list[np.ndarray] = []
-    if cloud.rgb is not None:
-        channels += list(np.moveaxis(np.asarray(cloud.rgb, np.float64), -1, 0))
-    if cloud.amplitude is not None:
-        channels.append(cloud.amplitude)
-    for channel in channels:
-        judged = np.isfinite(channel) & inside
-        if not judged.any():
-            continue
-        filled = np.where(np.isfinite(channel), channel, np.median(channel[judged]))
-        steepness = np.hypot(*np.gradient(_boxed(_boxed(filled))))
-        typical = max(float(np.median(steepness[judged])), 1e-9)
-        edges |= judged & (steepness > MARKED * typical)
-    return parts_with(edges, edges, least=LEAST_OBJECT_PX)
-
-
-def _boxed(image: np.ndarray) -> np.ndarray:
-    return cv2.blur(image, (PATCH_PX, PATCH_PX), borderType=cv2.BORDER_REFLECT)
-
-
 # --- the target's rim ---
 
 
@@ -854,7 +430,7 @@ def _mixed_rim(
     the surface."""
     judged = np.isfinite(evidence.score)
     filled = holes_filled(judged)
-    depth_px = _depth_px(filled)
+    depth_px = rim_distance_px(filled)
     flat_px = depth_px.reshape(-1)
     calls = detector.find(cloud, _only(evidence, behind(evidence)), threshold)
     reaches_px = [
@@ -864,9 +440,3 @@ def _mixed_rim(
     if len(along) < RIM_CALLS or filled.all():
         return np.zeros(judged.shape, bool)
     return (depth_px <= max(along)) & judged
-
-
-def _depth_px(mask: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not
-    count as a rim."""
-    return ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]

@@ -19,7 +19,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from detectors.findings.null import MARKS, PLAIN, RIM, Tail, behind, is_at_rim, marks_of
+from detectors.findings.null import MARKS, PLAIN, RIM, behind, is_at_rim
+from detectors.findings.objects import marks_of
+from detectors.findings.tails import Tail
 from detectors.interface import Detection, Evidence, MissingReturns
 from harness.vocabulary.geometry import Cloud
 

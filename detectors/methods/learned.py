@@ -24,9 +24,9 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
+from detectors.methods.deviations import RIM_PX
 from detectors.methods.matched import (
     LOBE_SHARE,
-    RIM_PX,
     MatchedConfig,
     MatchedDetector,
     Whitened,

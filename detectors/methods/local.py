@@ -21,8 +21,9 @@ from pydantic import Field, model_validator
 
 from detectors.crop import AutoCrop, CropConfig, crop
 from detectors.findings import whitening
-from detectors.findings.measure import HoleModelConfig, measure_detection
+from detectors.findings.measure import measure_detection
 from detectors.findings.rim import on_pixels, reach_of, rim_variances
+from detectors.findings.surroundings import HoleModelConfig
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN, root_of
 from detectors.pixels.masks import outline_depth_px

@@ -1,5 +1,5 @@
 """The scatter of scores by zone (`detectors.methods.scatter`) and the strongest of several
-templates (`detectors.methods.matched`), written plainly."""
+templates (`detectors.methods.template_scores`), written plainly."""
 
 import numpy as np
 from scipy.optimize import brentq

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 
 def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -102,6 +103,12 @@ def outline_depth_px(known: np.ndarray) -> np.ndarray:
     padded = cv2.copyMakeBorder(known.astype(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     return np.ascontiguousarray(cv2.distanceTransform(closed, cv2.DIST_C, 3)[2:-2, 2:-2])
+
+
+def rim_distance_px(mask: np.ndarray) -> np.ndarray:
+    """Return the distance (h, w) of each pixel of a mask to its rim; the image's own edge does not
+    count as a rim."""
+    return ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]
 
 
 def nearest_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

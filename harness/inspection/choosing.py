@@ -26,7 +26,8 @@ from typing import Any, Protocol, cast, runtime_checkable
 import cv2
 import numpy as np
 
-from detectors.findings.null import Tail, behind, threshold_at
+from detectors.findings.null import behind
+from detectors.findings.tails import Tail, threshold_at
 from detectors.findings.virtual_holes import (
     VirtualHoles,
     places_apart,

@@ -15,10 +15,11 @@ from detectors.findings.beside_joints import (
     fragments_of,
     without_damage,
 )
+from detectors.findings.extents import measure_extents
 from detectors.findings.joints import joined, joints_facts, joints_of
-from detectors.findings.measure import measure_extents
 from detectors.findings.missing import measure_missing, missing_returns, one_damage_once
-from detectors.findings.null import RIM_PX, OwnThreshold, each_object_once, own_threshold
+from detectors.findings.null import RIM_PX, OwnThreshold, own_threshold
+from detectors.findings.objects import each_object_once
 from detectors.findings.odds import noise_probabilities
 from detectors.interface import Detection, Detector, Evidence, Measurement, MissingReturns
 from detectors.surfaces.background import misfit

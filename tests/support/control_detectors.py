@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from detectors.crop import BoxCrop, CropConfig, crop
-from detectors.findings.measure import measure_extents
+from detectors.findings.extents import measure_extents
 from detectors.interface import Detection, Evidence, Measurement, TrueDamage
 from detectors.score_map import above
 from harness.vocabulary.config import Config

@@ -334,7 +334,7 @@ def _judged(
 def _findings(places_m: np.ndarray, above: np.ndarray, link_m: float) -> Findings:
     """Return the findings of pixels ``above`` (h, w), joined by steps of at most ``link_m``,
     without scores; their centres (m, 2) lie on the face."""
-    from detectors.findings.measure import centres_of
+    from detectors.findings.extents import centres_of
     from detectors.pixels.clusters import euclidean_clusters
     from detectors.score_map import Findings
 

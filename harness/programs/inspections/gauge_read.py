@@ -16,7 +16,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.inspection import output
-    from harness.inspection.run import inspected, print_inspection, write_inspection
+    from harness.inspection.presentation import print_inspection, write_inspection
+    from harness.inspection.run import inspected
     from harness.programs.inspections.gauge_board import HITS_AND_MISSES, read_gauge, seen_on
     from harness.records.outputs import GAUGE_ROWS
     from harness.vocabulary.text import show

@@ -21,7 +21,7 @@ from detectors.findings.hole_model import (
     sight,
     straight_sight,
 )
-from detectors.findings.measure import local_plane
+from detectors.findings.surroundings import local_plane
 from detectors.findings.whitening import correlated_products
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from detectors.findings.extents import extents
 from detectors.findings.family import BLURS
 from detectors.findings.hole_model import HolePatch, pictures, sight
-from detectors.findings.measure import (
+from detectors.findings.measure import _modelled, measure_detection
+from detectors.findings.surroundings import (
     HoleModelConfig,
     _blurs_of,
-    _modelled,
-    _surroundings,
     _tilt_m,
     blur_in_cells,
-    extents,
-    measure_detection,
+    surroundings_of,
 )
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud, MapViews, Region
@@ -331,7 +330,7 @@ def test_a_centre_s_error_is_that_along_one_axis() -> None:
     board = Board(12.7, 12.7)
     cloud, evidence = board.seen(0.2, 1)
     detection = strongest(cloud, evidence, 5.0)
-    around = _surroundings(cloud, evidence, detection, HoleModelConfig())
+    around = surroundings_of(cloud, evidence, detection, HoleModelConfig())
     assert around is not None
     size, _ = _modelled(around, HoleModelConfig())
     assert size is not None
@@ -444,7 +443,7 @@ def test_the_lens_widens_the_picture_and_not_the_noise() -> None:
     assert measured(board, 0.005, 1).model_diameter_m > 1.06 * 5.0e-3
     cloud, evidence = board.seen(0.005, 1)
     detection = strongest(cloud, evidence, 5.0)
-    around = _surroundings(cloud, evidence, detection, stated)
+    around = surroundings_of(cloud, evidence, detection, stated)
     assert around is not None
     assert around.patch.noise_px == (5.0, 5.0)
     assert around.patch.blur_px == (5.0, 5.0)
@@ -457,7 +456,7 @@ def test_a_filter_is_stated_by_the_settings_except_that_of_a_recording() -> None
     detection = strongest(cloud, evidence, 5.0)
 
     def patch(cloud: Cloud, config: HoleModelConfig) -> HolePatch:
-        around = _surroundings(cloud, evidence, detection, config)
+        around = surroundings_of(cloud, evidence, detection, config)
         assert around is not None
         return around.patch
 

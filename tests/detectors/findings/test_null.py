@@ -15,21 +15,17 @@ from scipy.stats import poisson
 from detectors import load_detector
 from detectors.findings import null
 from detectors.findings.null import (
-    DRAWS,
-    EXPONENTS,
     FEWEST_PEAKS,
     MOST,
-    PRIOR,
-    Tail,
-    _count_reaching,
     _fitting_tail,
     _floor_among,
     _floor_of,
     behind,
-    each_object_once,
     own_threshold,
     skew_of,
 )
+from detectors.findings.objects import each_object_once
+from detectors.findings.tails import DRAWS, EXPONENTS, PRIOR, Tail, _count_reaching
 from detectors.interface import Evidence
 from harness.vocabulary.geometry import Cloud, Region
 from tests.validation.own_null import boards
@@ -421,8 +417,8 @@ def test_a_bump_with_a_single_finding_stays_as_it_was_found() -> None:
 
 
 def test_the_prior_weights_of_exponents_are_probabilities() -> None:
-    assert null.PRIOR.sum() == pytest.approx(1.0, abs=1e-12)
-    assert (null.PRIOR > 0).all()
-    assert len(null.PRIOR) == len(null.EXPONENTS)
+    assert PRIOR.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (PRIOR > 0).all()
+    assert len(PRIOR) == len(EXPONENTS)
     # averages of a camera's noise are near normal
-    assert null.PRIOR[:2].sum() > 0.8
+    assert PRIOR[:2].sum() > 0.8

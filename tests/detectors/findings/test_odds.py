@@ -13,13 +13,10 @@ from detectors.findings.null import (
     MARKS,
     PLAIN,
     RIM,
-    Marks,
     OwnThreshold,
-    Tail,
-    counts_of,
-    marks_of,
     own_threshold,
 )
+from detectors.findings.objects import Marks, marks_of
 from detectors.findings.odds import (
     LAWS,
     STEEPNESS,
@@ -27,6 +24,7 @@ from detectors.findings.odds import (
     noise_probabilities,
     share_of_noise,
 )
+from detectors.findings.tails import Tail, counts_of
 from detectors.interface import Detection, Evidence, MissingReturns
 from detectors.pixels.masks import grown
 from harness.inspection.judging import null_facts

@@ -25,19 +25,17 @@ from detectors.findings.whitening import (
 )
 from detectors.interface import Detection, Evidence
 from detectors.methods import local as local_methods
+from detectors.methods.deviations import RIM_PX, in_deviations, without_rim
 from detectors.methods.local import LocalDetector
 from detectors.methods.matched import (
     CLIP_SIGMAS,
-    RIM_PX,
-    WIDE_PX,
     MatchedDetector,
     _cores,
     _fill_discs,
-    _in_deviations,
     _side_lobes,
     _tamed,
-    _without_rim,
 )
+from detectors.methods.scatter import WIDE_PX
 from detectors.pixels.masks import grown, outline_depth_px
 from harness.testing.synthetic_clouds import SHAPE, plane, without
 from harness.vocabulary.geometry import Cloud
@@ -258,20 +256,20 @@ def test_residuals_are_in_units_of_the_noise_and_weights() -> None:
     """White noise of 0.3 mm, weights of 4 on one half: there a residual counts twice."""
     noise_m = 3e-4 * np.random.default_rng(1).standard_normal(SHAPE)
     weights = np.ones(SHAPE, np.float32)
-    result = _in_deviations(noise_m, weights, (0.0, 0.0))
+    result = in_deviations(noise_m, weights, (0.0, 0.0))
     assert result.values[10:-10, 10:-10].std() == pytest.approx(1.0, abs=0.05)
     assert np.median(result.unit_m) == pytest.approx(3e-4, rel=0.06)
     # the wave is wider than a filter's window: the unit stays that of the noise
     wave_m = 2e-3 * np.sin(np.arange(SHAPE[1]) / 12.0)
-    waved = _in_deviations(noise_m + wave_m, weights, (0.0, 0.0))
+    waved = in_deviations(noise_m + wave_m, weights, (0.0, 0.0))
     ratio = np.median(waved.unit_m) / np.median(result.unit_m)
     size = np.median(np.abs(noise_m + wave_m)) / np.median(np.abs(noise_m))
     assert ratio == pytest.approx(size, rel=0.15)
     # rounding sets the least unit
-    rounded = _in_deviations(noise_m, weights, (4e-6, 5e-6))
+    rounded = in_deviations(noise_m, weights, (4e-6, 5e-6))
     np.testing.assert_allclose(rounded.unit_m, 3e-3)
     weights[::3, ::3] = 4.0
-    weighed = _in_deviations(noise_m, weights, (0.0, 0.0))
+    weighed = in_deviations(noise_m, weights, (0.0, 0.0))
     gain = weighed.values[20:60:3, 21:90:3] / result.values[20:60:3, 21:90:3]
     assert np.median(weighed.values[21:60:3, 21:90:3] / result.values[21:60:3, 21:90:3]) > 1.7
     assert np.median(gain) < 1.0
@@ -285,12 +283,12 @@ def test_what_the_rim_shares_is_taken_out_at_each_distance() -> None:
     shared = np.zeros_like(noise)
     shared[:, 0] = 1.5
     shared[:, 3] = -1.2
-    result = _without_rim(noise + shared, depth_px)
+    result = without_rim(noise + shared, depth_px)
     remainder = result.mean(axis=0)
     # half of what the fourth of six pixels share is left
     remainder[3] += 0.6
     # what those next to the rim share too stays
-    level = _without_rim(noise + shared + np.float32(0.8), depth_px).mean(axis=0)
+    level = without_rim(noise + shared + np.float32(0.8), depth_px).mean(axis=0)
     level[3] += 0.6
     np.testing.assert_allclose(level[:RIM_PX], 0.8, atol=0.5)
     # 100 pixels, of which some 65 count at each

@@ -7,7 +7,6 @@ import pytest
 
 from detectors.findings.templates import SlotSides, Template
 from detectors.methods import scatter_reference as reference
-from detectors.methods.matched import _keep_stronger
 from detectors.methods.scatter import (
     FEWEST,
     PART_PX,
@@ -19,6 +18,7 @@ from detectors.methods.scatter import (
     tail_of,
     zones_of,
 )
+from detectors.methods.template_scores import keep_stronger
 
 SHAPE = (90, 120)
 NARROW = Template(np.zeros((1, 1)), 2.2)
@@ -174,7 +174,7 @@ def test_the_stronger_of_two_templates_is_kept(down: int, right: int) -> None:
                 if fits and abs(raised[i, j]) > abs(expected[row, column]):
                     expected[row, column] = raised[i, j]
                     expected_by[row, column] = 3
-    _keep_stronger(signed, template, scores, 1 / 2.0, 1.3, down, right, 3)
+    keep_stronger(signed, template, scores, 1 / 2.0, 1.3, down, right, 3)
     np.testing.assert_allclose(signed, expected, rtol=1e-5)
     np.testing.assert_array_equal(template, expected_by)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from detectors import load_detector
-from detectors.findings.null import Tail, calls_at, threshold_at
+from detectors.findings.tails import Tail, calls_at, threshold_at
 from detectors.interface import Detection, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
 from detectors.surfaces.background import Background, background

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from detectors.averages.average import RECORDED, average
-from detectors.findings.null import behind, each_object_once
+from detectors.findings.null import behind
+from detectors.findings.objects import each_object_once
 from detectors.methods.local import LocalConfig, LocalDetector
 from detectors.pixels.noise import REACH_FRAMES, with_noise
 from detectors.recordings import open_capture

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from detectors.findings.measure import measure_extents
+from detectors.findings.extents import measure_extents
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.methods.thesis import ThesisDetector
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, above, on_grid

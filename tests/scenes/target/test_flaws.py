@@ -12,7 +12,8 @@ import pytest
 import trimesh
 from scipy.ndimage import uniform_filter
 
-from detectors.findings.measure import HoleModelConfig, measure_detection
+from detectors.findings.measure import measure_detection
+from detectors.findings.surroundings import HoleModelConfig
 from detectors.interface import Detection, Evidence, Measurement
 from harness.trials.board import LabelledCloud
 from harness.trials.judge import matched

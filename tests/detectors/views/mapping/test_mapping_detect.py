@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from detectors.findings.hole_model import lens_side, straight_sight
-from detectors.findings.measure import HoleModelConfig, _lens_sides, blur_in_cells
+from detectors.findings.surroundings import HoleModelConfig, _lens_sides, blur_in_cells
 from detectors.interface import Detection
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
 from detectors.views.mapping.merge import merge
