@@ -164,8 +164,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    here = Path(__file__).resolve().parents[1]
-    parser.add_argument("root", type=Path, nargs="?", default=here, help="another checkout")
+    root = Path(__file__).resolve().parents[1]
+    parser.add_argument("root", type=Path, nargs="?", default=root, help="another checkout")
     options = parser.parse_args()
     for line in report_lines(options.root):
         print(line)

@@ -151,10 +151,10 @@ def test_the_rules_see_a_forbidden_import_and_a_circle(tmp_path):
 
 def test_tests_have_the_same_folders_as_the_product():
     """A folder of tests that has no room of the product would be of code that has moved."""
-    own = {"support", "strangers", "validation", "benchmarks", "mutants", "fuzz"}
+    own_folders = {"support", "strangers", "validation", "benchmarks", "mutants", "fuzz"}
     for path in (ROOT / "tests").rglob("test_*.py"):
         folder = path.parent.relative_to(ROOT / "tests")
-        if folder.parts and folder.parts[0] not in own:
+        if folder.parts and folder.parts[0] not in own_folders:
             assert (ROOT / folder).is_dir(), path
 
 

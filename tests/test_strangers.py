@@ -51,11 +51,13 @@ def test_wrong_answers_are_wrong(board):
     clear = [row for row, truth in zip(true, board[2], strict=True) if truth.clear]
     clear.sort(key=lambda row: -float(row["diameter_mm"]))
     on_wall = {**clear[0], "x_mm": "-400", "y_mm": "-330", "z_mm": "1300"}
-    other = {"hole": "bump", "bump": "hole"}[clear[0]["kind"]]
+    opposite = {"hole": "bump", "bump": "hole"}[clear[0]["kind"]]
     answers = {
         "missed": [row for row in true if row is not clear[0]],
         "another surface": [*true, on_wall],
-        f"a {other} where": [{**row, "kind": other} if row is clear[0] else row for row in true],
+        f"a {opposite} where": [
+            {**row, "kind": opposite} if row is clear[0] else row for row in true
+        ],
         "diameter": [{**row, "diameter_mm": "200"} if row is clear[0] else row for row in true],
         "depth": [{**row, "depth_mm": "-500"} if row is clear[0] else row for row in true],
     }
@@ -84,8 +86,8 @@ def test_a_wrong_size_is_warned_of_by_a_flag_that_says_why(board):
 def test_three_doubtful_false_findings_are_right_and_four_are_not(board):
     true = rows_of(board[2])
     depth_mm = true[0]["z_mm"]
-    places = [{"x_mm": f"{x}", "y_mm": "30", "z_mm": depth_mm} for x in (-40, -10, 10, 40)]
-    stray = [{**true[0], **place, "certainty": "doubtful"} for place in places]
+    centres = [{"x_mm": f"{x}", "y_mm": "30", "z_mm": depth_mm} for x in (-40, -10, 10, 40)]
+    stray = [{**true[0], **centre, "certainty": "doubtful"} for centre in centres]
     assert scored(*board, 0, "", [*true, *stray[:3]]).verdict == "right"
     four = scored(*board, 0, "", [*true, *stray])
     assert four.verdict == "wrong" and four.why == ("4 doubtful ones false",)

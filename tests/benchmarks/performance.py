@@ -205,8 +205,8 @@ def peers_of_clusters(runs: int) -> None:
 
     def same(first: np.ndarray, other: np.ndarray) -> str:
         counts = {
-            len(np.unique(each, axis=1).T)
-            for each in (np.stack([first, other]), first[None], other[None])
+            len(np.unique(points, axis=1).T)
+            for points in (np.stack([first, other]), first[None], other[None])
         }
         return (
             f"{'the same' if len(counts) == 1 else 'NOT the same'} {len(np.unique(other))} clusters"

@@ -204,13 +204,23 @@ def _write_runs(base: Path) -> None:
     from harness.__main__ import main
 
     runs = _new(base, "runs")
-    made = _new(base, "made")
+    folder = _new(base, "made")
     data = _new(base, "data")
     (runs / "tiny.yaml").write_text(tiny_sweep.STUDY)
     commands = [
         ["sweep", str(runs / "tiny.yaml"), "--out", str(runs / "out"), "--serial"],
-        ["gauge", "--diameters", "2:12", "--a50", "5", "--a90", "7", "--out", str(made / "gauge")],
-        ["flatfield", str(base / "wall" / "depth.npy"), "--out", str(made / "unit.npz")],
+        [
+            "gauge",
+            "--diameters",
+            "2:12",
+            "--a50",
+            "5",
+            "--a90",
+            "7",
+            "--out",
+            str(folder / "gauge"),
+        ],
+        ["flatfield", str(base / "wall" / "depth.npy"), "--out", str(folder / "unit.npz")],
     ]
     for words in commands:
         printed = io.StringIO()

@@ -264,5 +264,5 @@ def _files(folder: Path, case: Case) -> list[Path]:
 
 def _spoil_words(words: list[str], rng: np.random.Generator) -> None:
     """Replace an argument by an odd one."""
-    place = int(rng.integers(len(words)))
-    words[place] = ODD_WORDS[rng.integers(len(ODD_WORDS))]
+    index = int(rng.integers(len(words)))
+    words[index] = ODD_WORDS[rng.integers(len(ODD_WORDS))]

@@ -73,24 +73,24 @@ def _spoil_bytes(path: Path, rng: Rng) -> None:
     content = bytearray(path.read_bytes())
     kind = rng.integers(6)
     size = len(content)
-    near = max(1, min(size, int(rng.choice([64, 512, size or 1]))))
+    reach = max(1, min(size, int(rng.choice([64, 512, size or 1]))))
     if kind == 0 or not content:
-        content = content[: rng.integers(near)] if content else bytearray(b"\0")
+        content = content[: rng.integers(reach)] if content else bytearray(b"\0")
     elif kind == 1:
-        for place in rng.integers(near, size=rng.integers(1, 9)):
-            content[place] ^= 1 << int(rng.integers(8))
+        for index in rng.integers(reach, size=rng.integers(1, 9)):
+            content[index] ^= 1 << int(rng.integers(8))
     elif kind == 2:
-        start = int(rng.integers(near))
+        start = int(rng.integers(reach))
         length = int(rng.integers(1, 64))
         content[start : start + length] = rng.bytes(length)
     elif kind == 3:
-        start = int(rng.integers(near))
+        start = int(rng.integers(reach))
         content[start:start] = content[start : start + int(rng.integers(1, 256))]
     elif kind == 4:
-        start = int(rng.integers(near))
+        start = int(rng.integers(reach))
         del content[start : start + int(rng.integers(1, 64))]
     else:
-        start = int(rng.integers(near))
+        start = int(rng.integers(reach))
         fill = int(rng.choice([0, 255, 127]))
         content[start : start + 8] = bytes([fill]) * 8
     path.write_bytes(content)
@@ -114,11 +114,11 @@ def _spoil_lines(path: Path, rng: Rng) -> None:
 def _spoil_numbers(path: Path, rng: Rng) -> None:
     """Replace a number of the text by an odd one, most often in the first lines."""
     content = path.read_bytes()
-    places = [match.span() for match in NUMBER.finditer(content[:200_000])]
-    if not places:
+    spans = [match.span() for match in NUMBER.finditer(content[:200_000])]
+    if not spans:
         return
-    most = int(rng.choice([8, 40, len(places)]))
-    start, end = places[int(rng.integers(min(most, len(places))))]
+    count = int(rng.choice([8, 40, len(spans)]))
+    start, end = spans[int(rng.integers(min(count, len(spans))))]
     odd = ODD_NUMBERS[rng.integers(len(ODD_NUMBERS))]
     path.write_bytes(content[:start] + odd + content[end:])
 
@@ -230,8 +230,8 @@ def _odd_array(array: np.ndarray, rng: Rng) -> np.ndarray:
         return np.swapaxes(array, 0, -1)
     if is_number and array.size:
         changed = array.astype(float).ravel()
-        places = rng.integers(changed.size, size=max(1, changed.size // 3))
-        changed[places] = float(rng.choice([np.nan, np.inf, -np.inf, 1e300, -5.0, 0.0]))
+        indices = rng.integers(changed.size, size=max(1, changed.size // 3))
+        changed[indices] = float(rng.choice([np.nan, np.inf, -np.inf, 1e300, -5.0, 0.0]))
         return changed.reshape(array.shape)
     return array[..., ::2] if array.ndim else array
 
@@ -276,7 +276,7 @@ def _change_column(path: Path, rng: Rng) -> None:
 
     table = pq.read_table(path)
     name = table.column_names[int(rng.integers(table.num_columns))]
-    place = table.column_names.index(name)
+    column = table.column_names.index(name)
     values = table.column(name).to_pylist()
     kind = rng.integers(6)
     if kind == 0:
@@ -298,5 +298,5 @@ def _change_column(path: Path, rng: Rng) -> None:
         else:
             values = [str(value) for value in values]
             values[int(rng.integers(len(values)))] = str(odd)
-        table = table.set_column(place, name, pa.array(values))
+        table = table.set_column(column, name, pa.array(values))
     pq.write_table(table, path)

@@ -59,8 +59,8 @@ def test_an_input_depends_on_its_number_and_seed_only(base: Path, monkeypatch):
     before = content(first)
     again = prepared(base, 3, seed=2)
     assert (again.words, content(again)) == (first.words, before)
-    others = [content(prepared(base, 3, seed=seed)) for seed in range(3, 8)]
-    assert any(other != before for other in others)
+    contents = [content(prepared(base, 3, seed=seed)) for seed in range(3, 8)]
+    assert any(content_of_seed != before for content_of_seed in contents)
 
 
 def test_a_bug_counts_as_a_traceback(base: Path, monkeypatch):

@@ -94,11 +94,11 @@ def _run_all(pipe: Connection, base: Path, numbers: Sequence[int], seed: int, on
     load_mitsuba()  # before Open3D, whose C++ library LLVM cannot use
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, resource.RLIM_INFINITY))
     for number in numbers:
-        given = prepared(base, number, seed, only)
-        pipe.send(given)
-        end = run_one(given)
+        case = prepared(base, number, seed, only)
+        pipe.send(case)
+        end = run_one(case)
         if end.state != "traceback":
-            shutil.rmtree(given.folder, ignore_errors=True)
+            shutil.rmtree(case.folder, ignore_errors=True)
         pipe.send(end)
 
 

@@ -22,9 +22,9 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_examples_of_the_docstrings_hold(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = {
-        each.name: each
-        for each in doctest.DocTestFinder().find(api, "tofpod", module=api)
-        if each.examples
+        example.name: example
+        for example in doctest.DocTestFinder().find(api, "tofpod", module=api)
+        if example.examples
     }
     flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
     runner = doctest.DocTestRunner(optionflags=flags)
@@ -64,7 +64,7 @@ def test_bad_input_is_refused_as_programs_refuse_it(wrong, said):
 def test_results_are_tables_and_limits(tmp_path):
     record = study_record(Study(boards=12, set_ups=(SetUp(), SetUp(frames=5, a50_mm=5.0))))
     (tmp_path / "study.json").write_text(record_text(record))
-    write_table(tmp_path, LIMITS, LIMITS.frame([limit_of(each) for each in record.set_ups]))
+    write_table(tmp_path, LIMITS, LIMITS.frame([limit_of(set_up) for set_up in record.set_ups]))
     result = tofpod.limits(tmp_path)
     curves = tofpod.plot_pod(result).axes[0].get_lines()
     assert len([line for line in curves if len(line.get_xdata()) > 9]) == 2

@@ -103,7 +103,9 @@ def test_it_says_first_what_it_took_and_how_to_take_another(
     )
     assert second.startswith("  instead, with --target 2: 1.20 m away (1.20 to 1.20 m), ")
     message = json.loads((tmp_path / "out" / "findings.json").read_text())["target"]
-    assert message["taken"] == 1 and [each["number"] for each in message["candidates"]] == [1, 2]
+    assert message["taken"] == 1 and [
+        candidate["number"] for candidate in message["candidates"]
+    ] == [1, 2]
     assert message["candidates"][0]["extent_mm"] == pytest.approx([300, 240], abs=8)
     picture = cv2.imread(str(tmp_path / "out" / "targets.png"))
     assert (picture == (255, 0, 255)).all(axis=-1).sum() > 1000
@@ -398,8 +400,8 @@ def test_a_hole_to_the_room_behind_is_flagged(
 
 
 def test_settings_reach_the_detector(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    own = ["--detector", "thesis", "--set", "scale=highest_before"]
-    assert detect.main([str(capture), *own, "--average", "median"]) == 0
+    own_scale = ["--detector", "thesis", "--set", "scale=highest_before"]
+    assert detect.main([str(capture), *own_scale, "--average", "median"]) == 0
     printed = capsys.readouterr().out
     assert "threshold: 1 x" in printed and "the detector's own" in printed
     assert detect.main([str(capture), "--max-frames", "2"]) == 0
@@ -634,16 +636,16 @@ def test_the_drilled_plate_as_it_stands(
     # one false call is expected on the bare plate, the others at the tags, where they are
     null = json.loads((tmp_path / "findings.json").read_text())["surface"]["own_null"]
     assert null["expected"] - null["at_marks"] == pytest.approx(1.0, rel=1e-3)
-    places = np.array([(float(row["u_px"]), float(row["v_px"])) for row in findings])
+    centres_px = np.array([(float(row["u_px"]), float(row["v_px"])) for row in findings])
     probabilities = np.array([float(row["noise_probability"]) for row in findings])
     is_bump = np.array([row["kind"] == "bump" for row in findings])
-    no_holes = np.linalg.norm(places[:, None] - BESIDE_TAGS, axis=2).min(axis=1) < 12
+    no_holes = np.linalg.norm(centres_px[:, None] - BESIDE_TAGS, axis=2).min(axis=1) < 12
     assert no_holes.sum() >= 4
     assert (probabilities[no_holes] > 0.3).all()
     # all bumps but the object are false
-    seen = no_holes.sum() + is_bump.sum() - 1
-    assert null["low"] < seen < null["high"]
-    mouths = np.linalg.norm(places[:, None] - MOUTHS, axis=2).min(axis=1) < 12
+    doubtful = no_holes.sum() + is_bump.sum() - 1
+    assert null["low"] < doubtful < null["high"]
+    mouths = np.linalg.norm(centres_px[:, None] - MOUTHS, axis=2).min(axis=1) < 12
     assert (probabilities[mouths & ~is_bump] < 0.05).mean() > 0.85
     assert probabilities[~is_bump & (probabilities < 0.05)].sum() < 1.0
 

@@ -28,8 +28,8 @@ def programs() -> Iterator[tuple[str, Program]]:
     for entry in PROGRAMS:
         program = importlib.import_module(entry.module).main
         yield entry.name, program
-        for word, further in program.further.items():
-            yield f"{entry.name} {word}", further
+        for word, nested in program.further.items():
+            yield f"{entry.name} {word}", nested
 
 
 @pytest.fixture
@@ -37,8 +37,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the examples that run need."""
     rng = np.random.default_rng(4)
     size = rng.uniform(1, 9, 80)
-    found = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
-    table = pd.DataFrame({"length": size, "length_mm": size, "found": found.astype(int)})
+    hits = rng.random(80) < 1 / (1 + np.exp(-2 * (size - 4)))
+    table = pd.DataFrame({"length": size, "length_mm": size, "found": hits.astype(int)})
     table["depth"] = 0.2 * size + rng.normal(0, 0.1, 80)
     table.to_csv(tmp_path / "inspections.csv", index=False)
     monkeypatch.chdir(tmp_path)
@@ -53,14 +53,14 @@ def test_the_help_ends_with_two_examples_that_are_understood(name: str, program:
     assert help_text.endswith(f"examples:\n  {first}\n  {second}\n")
     for example in program.examples:
         words = shlex.split(example)
-        given = words[1 + len(name.split()) :]
-        assert words == ["tofpod", *name.split(), *given]
-        parsed = vars(program.parser().parse_args(given))
+        arguments = words[1 + len(name.split()) :]
+        assert words == ["tofpod", *name.split(), *arguments]
+        parsed = vars(program.parser().parse_args(arguments))
         experiment = parsed.get("experiment")
         if experiment is not None:
             load_experiment(experiment, parsed.get("overrides") or ())
-        named = parsed.get("camera") or parsed.get("like") or ()
-        assert {named} - {()} if isinstance(named, str) else set(named) <= {*camera_names()}
+        names = parsed.get("camera") or parsed.get("like") or ()
+        assert {names} - {()} if isinstance(names, str) else set(names) <= {*camera_names()}
         detector = parsed.get("detector")
         assert detector in (None, "auto", *detector_names())
 

@@ -212,9 +212,13 @@ def _swapped_arguments(source: Source, node: ast.AST) -> Iterator[Edit]:
     if not isinstance(node, ast.Call) or _name_of(node) in SYMMETRIC_CALLS:
         return
     for first, second in zip(node.args, node.args[1:], strict=False):
-        alike = isinstance(first, SIMPLE) and type(first) is type(second)
+        is_same_kind = isinstance(first, SIMPLE) and type(first) is type(second)
         texts = (source.text(first), source.text(second))
-        if alike and texts[0] != texts[1] and not (_is_sequence(first) or _is_sequence(second)):
+        if (
+            is_same_kind
+            and texts[0] != texts[1]
+            and not (_is_sequence(first) or _is_sequence(second))
+        ):
             gap = source.data[source.end(first) : source.start(second)].decode()
             swapped = texts[1] + gap + texts[0]
             yield Edit(source.start(first), source.end(second), swapped)

@@ -29,13 +29,13 @@ def room_tests(tree: Path, file: str) -> tuple[list[str], list[str]]:
     The room's tests stand in the folder of ``tests`` with the module's path, or else in the nearest
     folder around it that has tests. Files in the folders around count if they import the module,
     but for those of ``tests`` itself, which look at the whole."""
-    whole = (tree / "tests", tree)
+    folders = (tree / "tests", tree)
     folder = tree / "tests" / Path(file).parent
     while not list(folder.glob("test_*.py")):
         folder = folder.parent
     in_room = sorted(folder.glob("test_*.py"))
     candidates = list(in_room)
-    while folder.parent not in whole:
+    while folder.parent not in folders:
         folder = folder.parent
         candidates += sorted(folder.glob("test_*.py"))
     direct = [path for path in candidates if module_name(file) in imported(path)]

@@ -103,8 +103,8 @@ class Tree:
         report = self.folder.parent / "report.xml"
         run = run_tests(self.folder, files, 3600.0, f"--junitxml={report}")
         if run.state != "passed":
-            what = run.test or run.state
-            self._failures[folder] = f"{what}: the tests fail on the unchanged product"
+            outcome = run.test or run.state
+            self._failures[folder] = f"{outcome}: the tests fail on the unchanged product"
             raise BrokenTests(self._failures[folder])
         return _seconds_of_files(report, files)
 

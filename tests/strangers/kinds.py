@@ -375,8 +375,8 @@ def _on_faces(
         radius = min(rng.uniform(0.006, 0.014), 0.7 * half_m)
         x = float(rng.choice(xs_m)) + rng.uniform(-0.3, 0.3) * (half_m - radius)
         y = rng.uniform(-0.85, 0.85) * half[1]
-        near = [np.hypot(x - o.x_m, y - o.y_m) < 0.05 for o in damages]
-        if len(damages) < n and abs(x) < half[0] - radius and not any(near):
+        is_near = [np.hypot(x - o.x_m, y - o.y_m) < 0.05 for o in damages]
+        if len(damages) < n and abs(x) < half[0] - radius and not any(is_near):
             profile = str(rng.choice(["flat", "bowl"]))
             damages.append(
                 Damage(x, y, radius, depth_m if profile == "flat" else 0.4 * radius, profile)
@@ -424,22 +424,22 @@ def cabled_wall(rng: Rng) -> Stranger:
     cables = []
     keep_off = []
     steps = int(rng.integers(2, 5))
-    for place in np.linspace(-0.28, 0.28, steps) * d * cam.width / cam.f_px:
+    for centrem in np.linspace(-0.28, 0.28, steps) * d * cam.width / cam.f_px:
         radius = rng.uniform(0.004, 0.012)
         high = radius + rng.uniform(0.0, 0.06)
         turn = float(rng.uniform(-12, 12))
-        base = target.point_m(float(place), 0.0) - target.R @ np.array([0, 0, high + radius])
+        base = target.point_m(float(centrem), 0.0) - target.R @ np.array([0, 0, high + radius])
         turned_R = target.R @ cv2.Rodrigues(np.array([0.0, 0.0, np.radians(turn)]))[0]
         cables.append(
             Surface(base, turned_R, 0.999 * radius, 3.0, "cylinder", radius, is_object=True)
         )
-        keep_off.append((place, turn, radius))
+        keep_off.append((centrem, turn, radius))
     target = damaged(rng, cam, target, 9, radius_mm=(6, 14), depth_mm=(4, 10))
     free = []
     for damage in target.damages:
         clear = True
-        for place, turn, radius in keep_off:
-            off = damage.x_m - place + damage.y_m * np.tan(np.radians(turn))
+        for centrem, turn, radius in keep_off:
+            off = damage.x_m - centrem + damage.y_m * np.tan(np.radians(turn))
             clear = clear and abs(off) > damage.radius_m + radius + 0.035
         if clear:
             free.append(damage)

@@ -119,9 +119,9 @@ def recorded(
     stack = np.empty((stranger.frames, *shape), np.float32)
     for k in range(stranger.frames):
         depth = clean if stranger.per_frame is None else stranger.per_frame(k, clean)
-        one = depth + noise.white_m * louder * _field(rng, shape, noise.blur_px, noise.tail)
-        one[gone | (rng.random(shape) < noise.dropout)] = np.nan
-        stack[k] = one
+        frame = depth + noise.white_m * louder * _field(rng, shape, noise.blur_px, noise.tail)
+        frame[gone | (rng.random(shape) < noise.dropout)] = np.nan
+        stack[k] = frame
     return stack, view, _truths(stranger, view)
 
 

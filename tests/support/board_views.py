@@ -142,14 +142,14 @@ def target_error_m(
 
 def _mark(points_m: np.ndarray, labels: np.ndarray, label: int, noise_m: float) -> Mark:
     picked = np.flatnonzero(labels == label)
-    own = points_m.reshape(-1, 3)[picked]
+    own_points = points_m.reshape(-1, 3)[picked]
     # the rim lies anywhere within a pixel: the centroid of n pixels with about 4 sqrt(n) at the
     # rim
     pitch = DISTANCE_M / LENS.fx
     rim = 4 * np.sqrt(len(picked)) * pitch**2 / 12 * (TAPE_M[0] / 2 / (len(picked) * pitch)) ** 2
     covariance = np.diag([rim, rim, max(noise_m, 1e-6) ** 2 / len(picked)])
     normal = np.array([0.0, 0.0, -1.0])
-    return Mark(own.mean(axis=0), covariance, normal, picked, TAPE_M[0] * TAPE_M[1])
+    return Mark(own_points.mean(axis=0), covariance, normal, picked, TAPE_M[0] * TAPE_M[1])
 
 
 def _colour(on_board_m: np.ndarray, labels: np.ndarray, textured: bool) -> np.ndarray:

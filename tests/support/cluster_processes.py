@@ -140,11 +140,11 @@ def hold_the_interpreter() -> None:
 
 
 def eat(megabytes: int) -> int:
-    held = []
+    processes = []
     for _ in range(megabytes // 10):
-        held.append(bytes(range(250)) * 40_000)
+        processes.append(bytes(range(250)) * 40_000)
         time.sleep(0.02)
-    return len(held)
+    return len(processes)
 
 
 def loaded() -> list[str]:
@@ -156,7 +156,7 @@ def threads() -> dict[str, int]:
     import cv2
     from threadpoolctl import threadpool_info
 
-    return {str(one["filepath"]): one["num_threads"] for one in threadpool_info()} | {
+    return {str(pool["filepath"]): pool["num_threads"] for pool in threadpool_info()} | {
         "cv2": cv2.getNumThreads()
     }
 

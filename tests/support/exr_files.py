@@ -34,11 +34,11 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], version: int = 2) 
     for row in range(height):
         numbers = b"".join(values[row].tobytes() for values in ordered.values())
         lines.append(struct.pack("<ii", row, len(numbers)) + numbers)
-    place = len(header) + 8 * height
+    offset = len(header) + 8 * height
     table = b""
     for line in lines:
-        table += struct.pack("<Q", place)
-        place += len(line)
+        table += struct.pack("<Q", offset)
+        offset += len(line)
     path.write_bytes(header + table + b"".join(lines))
     return path
 

@@ -43,8 +43,8 @@ def noise_table(camera: str) -> PlaneNoise:
     frame_mm = np.zeros((len(distances_m), len(albedos)))
     for row, distance_m in enumerate(distances_m):
         for column, albedo in enumerate(albedos):
-            one = noise_mm(camera, Conditions(distance_m, albedo, 1))
-            frame_mm[row, column] = np.sqrt(one**2 - FIXED_MM**2)
+            single_mm = noise_mm(camera, Conditions(distance_m, albedo, 1))
+            frame_mm[row, column] = np.sqrt(single_mm**2 - FIXED_MM**2)
     return PlaneNoise(distances_m, albedos, frame_mm, np.full_like(frame_mm, FIXED_MM))
 
 
@@ -75,7 +75,7 @@ def shard(camera: str, seed: int = 1) -> CameraLimits:
                     for frames in (1, 50):
                         conditions = Conditions(distance_m, albedo, frames, depth_mm)
                         set_ups.append(set_up(camera, kind, conditions, stream))
-    about = {
+    origin = {
         "versions": {"tofpod": __version__},
         "digests": {},
         "sources": sources_digest(),
@@ -87,7 +87,7 @@ def shard(camera: str, seed: int = 1) -> CameraLimits:
         camera=camera,
         titles=TITLES[camera],
         warning="",
-        about=about,
+        about=origin,
         noise=noise_table(camera),
         set_ups=tuple(set_ups),
         checks=(),

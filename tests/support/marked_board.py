@@ -98,5 +98,7 @@ def _meet(pose: np.ndarray, slopes: np.ndarray, height_m: float) -> tuple[np.nda
 
 
 def _on_board(xy: np.ndarray) -> np.ndarray:
-    on: np.ndarray = (np.abs(xy[..., 0]) < HALF_WIDTH_M) & (np.abs(xy[..., 1]) < HALF_HEIGHT_M)
-    return on
+    on_board: np.ndarray = (np.abs(xy[..., 0]) < HALF_WIDTH_M) & (
+        np.abs(xy[..., 1]) < HALF_HEIGHT_M
+    )
+    return on_board

@@ -5,6 +5,6 @@ import re
 
 def first_words(page: str) -> list[str]:
     """Return the headline of a page and, if there is more of the answer, the paragraph below."""
-    found = re.search(r'<p class="answer">(.*?)</p>\n(?:<p>((?!Conditions).*?)</p>)?', page)
-    assert found is not None
-    return [text for text in found.groups() if text]
+    match = re.search(r'<p class="answer">(.*?)</p>\n(?:<p>((?!Conditions).*?)</p>)?', page)
+    assert match is not None
+    return [text for text in match.groups() if text]

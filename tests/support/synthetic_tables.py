@@ -257,12 +257,14 @@ def _holes(world: World, rng: np.random.Generator, variant: str, frames: int) ->
         }
         of_hole = {"hole": str(number), "true_diameter_mm": diameter, "true_x_mm": 254.0 - offset}
         of_hole |= {"true_offset_mm": offset}
-        each = {name: np.full(n, value) for name, value in of_hole.items()} | {
+        columns = {name: np.full(n, value) for name, value in of_hole.items()} | {
             "repeat": np.arange(n)
         }
-        each |= {"detected": detected, "state": np.where(detected, "found", "invisible")}
-        each |= {"signal": np.where(detected, 9.0, 3.0)}
-        parts.append(each | {name: np.where(detected, v, np.nan) for name, v in measured.items()})
+        columns |= {"detected": detected, "state": np.where(detected, "found", "invisible")}
+        columns |= {"signal": np.where(detected, 9.0, 3.0)}
+        parts.append(
+            columns | {name: np.where(detected, v, np.nan) for name, v in measured.items()}
+        )
     # one frame: tests make hundreds, and joining one for each hole took most of their time
     return pd.DataFrame(
         of_all | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

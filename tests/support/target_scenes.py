@@ -279,8 +279,8 @@ def bent_sheet(random, scene):
     inner = random.random() < 0.5
     centre = [0, 0, away - radius if inner else away + radius]
     scene.cylinder(1, centre, [random.uniform(-0.2, 0.2), 1, 0], radius, 0.2, inner)
-    other = scene.slopes[..., 0] * scene.z
-    beyond = (np.abs(other) > random.uniform(0.15, 0.24)) & (scene.name == 1)
+    x_m = scene.slopes[..., 0] * scene.z
+    beyond = (np.abs(x_m) > random.uniform(0.15, 0.24)) & (scene.name == 1)
     scene.z[beyond] = np.inf
     scene.name[beyond] = -1
     scene.wall(0, away + random.uniform(0.5, 1.2))

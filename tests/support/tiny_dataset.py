@@ -32,7 +32,7 @@ study: {{boards: 4, hole_free_boards: 1, units: 2}}
 def write(home: Path, out: str, *arguments: str) -> int:
     """Run the program on the family of boards; renders are kept in ``home/results``."""
     (home / "tiny.yaml").write_text(FAMILY)
-    given = [
+    options = [
         str(home / "tiny.yaml"),
         "--boards",
         "10",
@@ -41,7 +41,7 @@ def write(home: Path, out: str, *arguments: str) -> int:
         "--results",
         str(home / "results"),
     ]
-    return dataset.main([*given, "--serial", *arguments])
+    return dataset.main([*options, "--serial", *arguments])
 
 
 def names_in(folder: Path) -> list[str]:

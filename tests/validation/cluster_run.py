@@ -199,9 +199,9 @@ def report_cost(experiment: object, journal: Journal, outcome: Outcome) -> dict[
     began = time.monotonic()
     entries = [entry for key in keys[:2000] if (entry := journal.read(key)) is not None]
     read = (time.monotonic() - began) / len(entries)
-    with tempfile.TemporaryDirectory(dir=journal.folder.parent) as other:
+    with tempfile.TemporaryDirectory(dir=journal.folder.parent) as second_folder:
         began = time.monotonic()
-        copied = Journal(Path(other))
+        copied = Journal(Path(second_folder))
         for key, entry in zip(keys, entries, strict=False):
             copied.write(key, Ended(**vars(entry)))
         write = (time.monotonic() - began) / len(entries)

@@ -137,7 +137,7 @@ def main(arguments: list[str]) -> int:
             if model is None:
                 print(f"{name}, {board}: whole frames cost less", flush=True)
                 continue
-            whole = drawn(unit, None, options.frames)
+            complete = drawn(unit, None, options.frames)
             first_order = drawn(unit, model, options.frames)
             is_uneven = np.zeros(model.shape, bool)
             is_uneven.ravel()[model.linear.uneven] = True
@@ -148,7 +148,7 @@ def main(arguments: list[str]) -> int:
                 "listed": ~is_linear,
             }
             for group, pixels in groups.items():
-                line = row(pixels[unit.cut], whole, first_order)
+                line = row(pixels[unit.cut], complete, first_order)
                 print(f"{name}, {board}, {group} {line}", flush=True)
     return 0
 

@@ -75,7 +75,7 @@ class Bins:
 
     def laws(self, frequencies_hz: tuple[float, ...]) -> dict[str, np.ndarray]:
         """Return the regressors (bins, p) of each law."""
-        one = np.ones_like(self._range_m)
+        ones = np.ones_like(self._range_m)
 
         def offset(of: list[float]) -> list[np.ndarray]:
             columns = []
@@ -87,9 +87,9 @@ class Bins:
         first = frequencies_hz[0]
         last = frequencies_hz[-1]
         laws = {
-            "one error for all pixels": [one],
+            "one error for all pixels": [ones],
             "proportional to range": [self._range_m],
-            "constant and range": [one, self._range_m],
+            "constant and range": [ones, self._range_m],
             f"offset, {last / 1e6:.0f} MHz": offset([last]),
             f"offset, {first / 1e6:.0f} and {last / 1e6:.0f} MHz": offset([first, last]),
         }
@@ -103,9 +103,9 @@ class Bins:
         weight = 1 / np.sqrt(self.variance)
         target = (self.errors_mm * weight).T
         factors = np.linalg.lstsq(regressors * weight[:, None], target, rcond=None)[0]
-        left = target - regressors * weight[:, None] @ factors
+        remaining = target - regressors * weight[:, None] @ factors
         bins, terms = regressors.shape
-        return float((left**2).sum() / (target.shape[1] * (bins - terms)))
+        return float((remaining**2).sum() / (target.shape[1] * (bins - terms)))
 
 
 def _table(misfits: Mapping[str, tuple[int, float]]) -> str:

@@ -70,10 +70,10 @@ def main() -> None:
                 rows.setdefault(quantity, []).append((truth, estimate, interval))
         for quantity, results in rows.items():
             truth = results[0][0]
-            found = float(np.mean([estimate for _, estimate, _ in results]))
+            mean = float(np.mean([estimate for _, estimate, _ in results]))
             half = float(np.mean([(ends.high - ends.low) / 2 for _, _, ends in results]))
-            held = sum(ends.low <= truth <= ends.high for _, _, ends in results)
-            cells = (f"{truth:.2f}", f"{found:.2f}", f"{half:.2f}", f"{held} of {draws}")
+            covered = sum(ends.low <= truth <= ends.high for _, _, ends in results)
+            cells = (f"{truth:.2f}", f"{mean:.2f}", f"{half:.2f}", f"{covered} of {draws}")
             print(f"| {name} | {quantity} | {' | '.join(cells)} |", flush=True)
 
 

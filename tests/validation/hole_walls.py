@@ -202,11 +202,11 @@ def put_into(view: NoiseFreeView, part: NoiseFreeView) -> None:
     """Replace the light of a view in the region of another, in place."""
     rows, columns = part.region.within(view.region)
     for name in PER_PIXEL:
-        whole = getattr(view, name)
+        values = getattr(view, name)
         if name.startswith("phasor"):
-            whole[:, rows, columns] = getattr(part, name)
+            values[:, rows, columns] = getattr(part, name)
         else:
-            whole[rows, columns] = getattr(part, name)
+            values[rows, columns] = getattr(part, name)
 
 
 def main(arguments: list[str]) -> int:

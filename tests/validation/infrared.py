@@ -93,9 +93,9 @@ def spread(distance_px: np.ndarray, blur_px: float, pixel_px: float) -> np.ndarr
 def _shapes(line: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the (n, 5) shapes of which a piece is a sum: both sides, their shading across the
     edge, and shading along it. ``line``: place, slope and bow of the edge, and its blur."""
-    place, slope, bow, blur_px = line
+    offset, slope, bow, blur_px = line
     across = 1 / np.sqrt(1 + slope**2)
-    distance_px = ((u - (place + slope * v + bow * v**2)) * across).ravel()
+    distance_px = ((u - (offset + slope * v + bow * v**2)) * across).ravel()
     second = spread(distance_px, max(abs(blur_px), 0.02), across)
     first = 1 - second
     return np.stack([first, second, distance_px * first, distance_px * second, v.ravel()], axis=1)
@@ -113,8 +113,8 @@ def fitted_piece(image: np.ndarray, row: int, column: int) -> EdgePiece | None:
     steps = np.abs(np.diff(ndimage.uniform_filter1d(piece, 5, axis=0), axis=1))
     steps = np.maximum(steps - np.median(steps, axis=1, keepdims=True), 0) ** 2
     between = np.arange(-HALF_WIDTH_PX, HALF_WIDTH_PX) + 0.5
-    places = (steps * between).sum(axis=1) / np.maximum(steps.sum(axis=1), 1e-9)
-    slope, place = np.polyfit(v[:, 0], places, 1)
+    positions = (steps * between).sum(axis=1) / np.maximum(steps.sum(axis=1), 1e-9)
+    slope, offset = np.polyfit(v[:, 0], positions, 1)
     if abs(slope) > STEEPEST:
         return None
     light = piece.ravel()
@@ -123,7 +123,7 @@ def fitted_piece(image: np.ndarray, row: int, column: int) -> EdgePiece | None:
         shapes = _shapes(line, u, v)
         return np.asarray(shapes @ np.linalg.lstsq(shapes, light)[0] - light)
 
-    start = [place, slope, 0.0, 0.6]
+    start = [offset, slope, 0.0, 0.6]
     fit = optimize.least_squares(left, start, x_scale=[0.3, 0.02, 1e-3, 0.2], max_nfev=30)
     variance = 2 * fit.cost / (light.size - 9)
     try:
@@ -213,11 +213,11 @@ def main() -> None:
     pieces = [("down", piece) for piece in edge_pieces(image)]
     pieces += [("across", piece) for piece in edge_pieces(np.ascontiguousarray(image.T))]
     for direction, piece in pieces:
-        place = f"row {piece.row:3}, column {piece.column:3}"
+        label = f"row {piece.row:3}, column {piece.column:3}"
         if direction == "across":
-            place = f"row {piece.column:3}, column {piece.row:3}"
+            label = f"row {piece.column:3}, column {piece.row:3}"
         print(
-            f"{place}, {direction:6}: blur {piece.blur_px:.2f} +- {piece.blur_error_px:.2f} px, "
+            f"{label}, {direction:6}: blur {piece.blur_px:.2f} +- {piece.blur_error_px:.2f} px, "
             f"{piece.dark_units:.0f} to {piece.bright_units:.0f} units"
         )
     blurs_px = np.sort([piece.blur_px for _, piece in pieces])

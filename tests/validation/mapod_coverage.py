@@ -104,8 +104,8 @@ def combined_limits(study: PodStatement, size: np.ndarray, hits: np.ndarray) -> 
             shares = zip(below, weights, strict=True)
             limits.append(
                 [
-                    np.interp(LIMIT_AT * sums[-1], sums - own / 2, sizes[order])
-                    for sums, own in shares
+                    np.interp(LIMIT_AT * sums[-1], sums - own_share / 2, sizes[order])
+                    for sums, own_share in shares
                 ]
             )
     return np.max(limits, axis=0)

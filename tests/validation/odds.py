@@ -123,15 +123,15 @@ def plane(offset_m: np.ndarray) -> Cloud:
 
 def judgement(detector: Detector, cloud: Cloud, damaged: np.ndarray) -> Judgement | None:
     """Judge a capture; None if it cannot set its own threshold."""
-    own = own_threshold(detector, cloud, detector.analyse(cloud), WANTED)
-    if own.doubts:
+    null = own_threshold(detector, cloud, detector.analyse(cloud), WANTED)
+    if null.doubts:
         return None
-    evidence = replace(own.evidence, notes={"own_null": null_facts(own)})
-    found = detector.find(cloud, evidence, own.threshold)
-    probabilities = noise_probabilities(cloud, evidence, found, None)
+    evidence = replace(null.evidence, notes={"own_null": null_facts(null)})
+    detections = detector.find(cloud, evidence, null.threshold)
+    probabilities = noise_probabilities(cloud, evidence, detections, None)
     is_damaged = damaged.reshape(-1)
-    is_false = [not is_damaged[detection.pixels].any() for detection in found]
-    return Judgement(np.array(probabilities), np.array(is_false, bool), own.expected)
+    is_false = [not is_damaged[detection.pixels].any() for detection in detections]
+    return Judgement(np.array(probabilities), np.array(is_false, bool), null.expected)
 
 
 def judgements(name: str, case: Case, captures: int) -> Iterator[Judgement]:
@@ -158,8 +158,8 @@ def row_text(judged: list[Judgement]) -> str:
     asked = WANTED * len(judged)
     parts = [f"{asked:.0f}", f"{probability.sum():.1f}", f"{is_false.sum()}"]
     number = np.clip(np.searchsorted(EDGES, probability) - 1, 0, len(EDGES) - 2)
-    for place in range(len(EDGES) - 1):
-        chosen = number == place
+    for bin_number in range(len(EDGES) - 1):
+        chosen = number == bin_number
         stated = float(probability[chosen].sum())
         parts.append(f"{stated:.1f} / {is_false[chosen].sum()} of {chosen.sum()}")
     return " | ".join(parts)

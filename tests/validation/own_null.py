@@ -149,15 +149,15 @@ def counts(board: Board, detector: Detector) -> Iterator[tuple[float, int] | Non
     trusted."""
     evidence = detector.analyse(board.cloud)
     for asked in ASKED:
-        own = own_threshold(detector, board.cloud, evidence, asked)
-        if own.doubts:
+        null = own_threshold(detector, board.cloud, evidence, asked)
+        if null.doubts:
             yield None
             continue
-        judged = np.isfinite(own.evidence.score)
+        judged = np.isfinite(null.evidence.score)
         share = float((judged & ~board.excused).sum() / judged.sum())
-        result = detector.find(board.cloud, own.evidence, own.threshold)
+        result = detector.find(board.cloud, null.evidence, null.threshold)
         excused = board.excused.reshape(-1)
-        yield own.expected * share, sum(not excused[each.pixels].any() for each in result)
+        yield null.expected * share, sum(not excused[finding.pixels].any() for finding in result)
 
 
 def main(arguments: list[str]) -> int:

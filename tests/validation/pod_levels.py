@@ -102,7 +102,7 @@ def weighted(
     targets = len(sizes_mm)
     least = min(NARROWEST / (targets - 1), 1.0)
     log_width = np.linspace(np.log(least), np.log(WIDEST), widths)
-    found = hits.astype(np.float32)
+    hit_weights = hits.astype(np.float32)
     values = []
     cells = []
     a90_mm = []
@@ -118,7 +118,7 @@ def weighted(
         log_hit, log_miss, _ = logs_of_link(link, (x[:, None] - mu) / sigma)
         log_hit = np.maximum(log_hit, -1e6).astype(np.float32)
         log_miss = np.maximum(log_miss, -1e6).astype(np.float32)
-        values.append(found @ log_hit + (1 - found) @ log_miss)
+        values.append(hit_weights @ log_hit + (1 - hit_weights) @ log_miss)
         cells.append(log_weights(all_widths, targets))
         x90 = mu + sigma * float(link_ppf(link, np.array(0.9)))
         with np.errstate(over="ignore"):

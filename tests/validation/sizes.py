@@ -128,8 +128,8 @@ def rows_of(cloud: Cloud, spec: dict[str, Any], name: str) -> list[dict[str, Any
 
 def summary(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     """Return medians and coverages by keys."""
-    found = rows[rows["found"]]
-    groups = found.groupby(keys)
+    found_rows = rows[rows["found"]]
+    groups = found_rows.groupby(keys)
     return pd.DataFrame(
         {
             "damages": rows.groupby(keys).size(),

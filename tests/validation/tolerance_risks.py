@@ -75,11 +75,13 @@ def reported(name: str, decisions: Sequence[Decided]) -> None:
     """Print the shares of wrong decisions, with their 95 % intervals, and all decisions."""
     print(f"compared with {name}: {len(decisions)} parts")
     for beyond, kind in ((True, "accepted beyond the tolerance"), (False, "rejected within it")):
-        group = [each for each in decisions if (each.true_mm > TOLERANCE.limit) == beyond]
-        wrong = sum(each.is_wrong for each in group)
+        group = [
+            decision for decision in decisions if (decision.true_mm > TOLERANCE.limit) == beyond
+        ]
+        wrong = sum(decision.is_wrong for decision in group)
         low, high = intervals.wilson(wrong, len(group))
         print(f"  {kind}: {wrong} of {len(group)} ({100 * low:.1f} to {100 * high:.1f} %)")
-    print(f"  {dict(Counter(each.decision for each in decisions))}", flush=True)
+    print(f"  {dict(Counter(decision.decision for decision in decisions))}", flush=True)
 
 
 def main(first: int, last: int) -> None:

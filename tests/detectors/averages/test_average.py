@@ -320,8 +320,8 @@ def test_the_scene_of_most_frames_counts() -> None:
     assert [frame.name for frame in cloud.left_out] == ["frame 0", "frame 3"]
     text = unsteadiness(cloud)
     assert text.startswith("2 of 6 frames differ from the others and are left out (frame 0, frame")
-    many = average(heaps([0, *range(1, 9)]), RECORDED)
-    assert "frame 5, frame 6, .. left out" in unsteadiness(many)
+    enough = average(heaps([0, *range(1, 9)]), RECORDED)
+    assert "frame 5, frame 6, .. left out" in unsteadiness(enough)
 
 
 @pytest.mark.parametrize(("noise_m", "blur_px"), [(1e-3, 1), (8e-3, 5), (30e-3, 1), (4e-3, 9)])

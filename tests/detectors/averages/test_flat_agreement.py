@@ -98,16 +98,16 @@ def test_a_capture_that_is_in_the_flat_field_is_refused(field: FlatField):
 @pytest.mark.parametrize("captures", [1, 2])
 def test_without_names_the_noise_tells_whose_frames_they_are(captures: int):
     """As in files of earlier versions; half of the noise is the least that shows."""
-    made = [frames_of(number) for number in range(captures)]
-    unnamed = replace(field_of(made), frames=frozenset())
-    assert "holds the noise of this capture" in refused(made[0], unnamed)
+    captures_made = [frames_of(number) for number in range(captures)]
+    unnamed = replace(field_of(captures_made), frames=frozenset())
+    assert "holds the noise of this capture" in refused(captures_made[0], unnamed)
     assert refused(frames_of(10), unnamed) == ""
 
 
 def test_frames_that_were_left_out_do_not_count_as_noise():
     """A frame that jumps by 20 mm, in one half only, would look like much noise."""
-    made = [frames_of(0)]
-    unnamed = replace(field_of(made), frames=frozenset())
+    captures = [frames_of(0)]
+    unnamed = replace(field_of(captures), frames=frozenset())
     frames = frames_of(10)
     jump = replace(frames[0], name="jump", z_m=frames[0].z_m + pattern().astype(np.float32) * 40)
     cloud = replace(cloud_of(frames), left_out=(LeftOut("jump", "jumps"),))
@@ -117,15 +117,15 @@ def test_frames_that_were_left_out_do_not_count_as_noise():
 
 
 def test_another_unit_s_flat_field_is_refused(field: FlatField):
-    other = frames_of(10, fixed_m=pattern()[::-1, ::-1])
-    assert "makes this capture rougher, from" in refused(other, field)
+    unrelated = frames_of(10, fixed_m=pattern()[::-1, ::-1])
+    assert "makes this capture rougher, from" in refused(unrelated, field)
 
 
 def test_a_flat_field_of_noise_only_is_accepted():
     """It takes nothing away; what it adds is less than a tenth."""
     bare = np.zeros((LENS.height, LENS.width))
-    made = [frames_of(number, fixed_m=bare) for number in range(8)]
-    assert refused(frames_of(10, fixed_m=bare), field_of(made)) == ""
+    captures = [frames_of(number, fixed_m=bare) for number in range(8)]
+    assert refused(frames_of(10, fixed_m=bare), field_of(captures)) == ""
 
 
 def test_few_frames_or_pixels_are_not_judged(field: FlatField):
@@ -143,16 +143,16 @@ def dented(depth_m: float, u: int = 90, v: int = 60, radius_px: int = 6) -> np.n
 def test_damage_in_both_is_doubted_unless_the_camera_moved():
     """The wall has a dent of 2.5 mm, and the camera stands still: the correction takes it away."""
     damaged = pattern() + dented(2.5 * MM)
-    made = field_of([frames_of(number, fixed_m=damaged) for number in range(2)])
-    assert not made.moved
-    cloud = corrected(cloud_of(frames_of(10, fixed_m=damaged)), made)
-    text = places_doubt(cloud, made, "unit.npz")
+    field = field_of([frames_of(number, fixed_m=damaged) for number in range(2)])
+    assert not field.moved
+    cloud = corrected(cloud_of(frames_of(10, fixed_m=damaged)), field)
+    text = places_doubt(cloud, field, "unit.npz")
     assert "stand out alike at one place as wide as damage" in text
-    (place,) = shared_places(cloud, made)
-    assert np.hypot(*(place - (90, 60))) < 6
-    assert places_doubt(cloud, replace(made, moved=True), "unit.npz") == ""
-    sound = corrected(cloud_of(frames_of(10)), made)
-    assert places_doubt(sound, made, "unit.npz") == "", "the dent is in the flat field only"
+    (shared,) = shared_places(cloud, field)
+    assert np.hypot(*(shared - (90, 60))) < 6
+    assert places_doubt(cloud, replace(field, moved=True), "unit.npz") == ""
+    sound = corrected(cloud_of(frames_of(10)), field)
+    assert places_doubt(sound, field, "unit.npz") == "", "the dent is in the flat field only"
 
 
 def test_a_pattern_that_the_capture_shows_as_well_is_not_doubted(field: FlatField):

@@ -335,9 +335,9 @@ def test_a_change_of_the_pattern_is_that_of_the_means() -> None:
     assert _change(patterns, variances, [], [2]) is None
     assert _change(patterns, variances, [2], []) is None
     for pixels, is_known in ((1, False), (2, True)):
-        few = np.full((2, 6, 7), np.nan)
-        few[:, 0, :pixels] = [[[1.0, 2.0]], [[3.0, 5.0]]][0][0][:pixels]
-        assert (_change(few, variances, [0], [1]) is not None) == is_known
+        sparse = np.full((2, 6, 7), np.nan)
+        sparse[:, 0, :pixels] = [[[1.0, 2.0]], [[3.0, 5.0]]][0][0][:pixels]
+        assert (_change(sparse, variances, [0], [1]) is not None) == is_known
 
 
 @pytest.mark.parametrize(
@@ -365,9 +365,9 @@ def test_a_camera_has_moved_if_its_plane_has(others, is_moved) -> None:
 )
 def test_a_camera_with_a_pose_has_moved_if_its_places_have(shift_m, is_moved) -> None:
     """By 30 mm along the surface; poses count more than planes."""
-    places = np.random.default_rng(6).normal(size=(4, 5, 2))
-    first = lone(0.5, places_m=places)
-    second = lone(0.9, places_m=places + shift_m)
+    points = np.random.default_rng(6).normal(size=(4, 5, 2))
+    first = lone(0.5, places_m=points)
+    second = lone(0.9, places_m=points + shift_m)
     assert _moved([first, second]) == is_moved
     assert _moved([first, first, second]) == is_moved
 
@@ -445,8 +445,8 @@ def test_a_drifting_pattern_s_variance_holds_for_the_next_capture() -> None:
     # a change below a fifth of the pattern is stable
     small = replace(second, residual_m=(base + 0.19 / 0.5 * change) * MM)
     large = replace(second, residual_m=(base + 0.24 / 0.5 * change) * MM)
-    for other, count in ((small, 1), (large, 2)):
-        assert len(separated([first, other], small_lens).field.warnings) == count
+    for field, count in ((small, 1), (large, 2)):
+        assert len(separated([first, field], small_lens).field.warnings) == count
     # a difference of the size of its noise is no change
     noisy_m2 = (0.5 * MM) ** 2
     quiet = replace(first, variance_m2=np.full((64, 64), 0.4 * noisy_m2))
@@ -494,14 +494,14 @@ def test_pattern_and_shape_are_those_of_dense_least_squares() -> None:
     information = design.T @ (design / noise[:, None]) + np.diag(prior)
     solution = np.linalg.solve(information, design.T @ (value / noise))
     covariance = np.linalg.inv(information)
-    seen = finite.any(axis=0)
-    np.testing.assert_allclose(error_m[seen], solution[:120].reshape(shape)[seen], atol=1e-3)
+    is_seen = finite.any(axis=0)
+    np.testing.assert_allclose(error_m[is_seen], solution[:120].reshape(shape)[is_seen], atol=1e-3)
     np.testing.assert_allclose(shapes_m[finite], solution[120:][cell], atol=1e-3)
     exact_m2 = covariance.diagonal()[:120].reshape(shape)
     # beliefs go around in loops
-    np.testing.assert_allclose(variance_m2[seen], exact_m2[seen], rtol=0.25)
-    assert np.isnan(error_m[~seen]).all()
-    assert np.isnan(variance_m2[~seen]).all()
+    np.testing.assert_allclose(variance_m2[is_seen], exact_m2[is_seen], rtol=0.25)
+    assert np.isnan(error_m[~is_seen]).all()
+    assert np.isnan(variance_m2[~is_seen]).all()
     assert np.isnan(shapes_m[~finite]).all()
 
 
@@ -538,12 +538,12 @@ def test_changes_in_time_and_in_range_compare_halves_and_ends() -> None:
     for distance_m, residual_m in zip(distances_m, residuals, strict=True):
         captures.append(lone(distance_m, residual_m=residual_m, variance_m2=0.01))
     result = separated(captures, Lens(30, 20, 50.0, 50.0, 15.0, 10.0))
-    near = residuals[[0, 2, 5]].mean(axis=0)
+    nearest_mean = residuals[[0, 2, 5]].mean(axis=0)
     first = residuals[[0, 1]].mean(axis=0)
     last = residuals[[2, 5, 4]].mean(axis=0)
     assert result.in_range is not None
     assert result.in_time is not None
-    in_range_m = np.sqrt(np.mean((near - residuals[3]) ** 2))
+    in_range_m = np.sqrt(np.mean((nearest_mean - residuals[3]) ** 2))
     assert result.in_range.difference_m == pytest.approx(in_range_m)
     assert result.in_range.noise_m == pytest.approx(np.sqrt(0.01 / 3 + 0.01))
     in_time_m = np.sqrt(np.mean((first - last) ** 2))
@@ -710,8 +710,8 @@ def test_the_program_writes_map_and_figures_and_detect_uses_it(recorded, tmp_pat
     assert len(facts["captures"]) == 3
     assert unit.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 
-    own = [walls[0], *options, "--threshold", "5", "--flat-field", str(unit)]
-    assert detect.main(own) == 2
+    own_arguments = [walls[0], *options, "--threshold", "5", "--flat-field", str(unit)]
+    assert detect.main(own_arguments) == 2
     assert "was made from this capture: 8 of its frames are in both" in capsys.readouterr().err
     judged = [str(recorded / "judged.npy"), *options, "--threshold", "5"]
     assert detect.main([*judged, "--flat-field", str(unit), "--out", str(tmp_path / "with")]) == 0
@@ -854,18 +854,18 @@ def test_a_correction_moves_points_along_their_rays_by_the_error() -> None:
     moved = corrected(cloud, field)
     before_m = np.linalg.norm(cloud.points_m, axis=-1)
     after_m = np.linalg.norm(moved.points_m, axis=-1)
-    known = np.isfinite(error_m)
-    np.testing.assert_allclose((before_m - after_m)[known], error_m[known], atol=1e-15)
-    np.testing.assert_array_equal(moved.points_m[~known], cloud.points_m[~known])
+    is_known = np.isfinite(error_m)
+    np.testing.assert_allclose((before_m - after_m)[is_known], error_m[is_known], atol=1e-15)
+    np.testing.assert_array_equal(moved.points_m[~is_known], cloud.points_m[~is_known])
     rays = cloud.points_m / before_m[..., None]
     np.testing.assert_allclose(moved.points_m / after_m[..., None], rays, atol=1e-12)
     # along the axis: the frames' noise and the map's, or the pattern where that is unknown
     cosine2 = rays[..., 2] ** 2
     assert moved.mean_variance_m2 is not None
-    frames_m2 = moved.mean_variance_m2 - cosine2 * np.where(known, field.variance_m2, 0.0)
-    unknown_m2 = frames_m2[~known] - (cosine2 * field.rms_m**2)[~known]
+    frames_m2 = moved.mean_variance_m2 - cosine2 * np.where(is_known, field.variance_m2, 0.0)
+    unknown_m2 = frames_m2[~is_known] - (cosine2 * field.rms_m**2)[~is_known]
     scatter_m2 = NOISE_M**2 / FRAMES
-    assert np.median(frames_m2[known]) == pytest.approx(scatter_m2, rel=0.02)
+    assert np.median(frames_m2[is_known]) == pytest.approx(scatter_m2, rel=0.02)
     assert np.median(unknown_m2) == pytest.approx(scatter_m2, rel=0.05)
     # a part of the sensor takes its part of the map
     part = replace(

@@ -146,8 +146,8 @@ def test_a_filter_by_light_is_that_of_phasors(brightness: float, radius_mm: floa
     depths_m = cv2.blur(light * hole[3], (5, 5)) / cv2.blur(light + face, (5, 5))
     image = pictures(patch, hole[None])[0]
     np.testing.assert_allclose(image, depths_m, atol=0.02 * hole[3])
-    alike = pictures(replace(patch, brightness=0.0), hole[None])[0]
-    assert np.abs(alike - depths_m).max() > 0.08 * hole[3]
+    unweighted = pictures(replace(patch, brightness=0.0), hole[None])[0]
+    assert np.abs(unweighted - depths_m).max() > 0.08 * hole[3]
 
 
 @pytest.mark.parametrize("radius_mm", [3.2, 4.5, 9.0])

@@ -167,8 +167,8 @@ def test_alike_slots_at_random_places_stay_findings() -> None:
 
 def test_three_slots_stay_findings_and_a_row_of_six_is_one() -> None:
     for count, features in ((3, 0), (6, 1)):
-        places = [(100, 40 + 40 * number) for number in range(count)]
-        assert len(joints_of(CLOUD, EVIDENCE, *wall(places))) == features
+        centres = [(100, 40 + 40 * number) for number in range(count)]
+        assert len(joints_of(CLOUD, EVIDENCE, *wall(centres))) == features
 
 
 def test_the_end_of_a_joint_at_the_rim_belongs_to_it() -> None:
@@ -219,9 +219,9 @@ def test_damage_that_touches_a_joint_is_a_finding_of_its_own() -> None:
     assert np.isnan(without.reshape(-1)[detections[0].pixels]).sum() == 0
     assert np.isnan(without[row - 10 : row + 10, column - 1 : column + 2]).all()
     assert np.isfinite(without.reshape(-1)[beside]).all()
-    whole = without_damage(feature, [part])
-    assert sorted(whole.members) == list(range(len(BRICKS)))
-    assert whole.differing == ()
+    undamaged = without_damage(feature, [part])
+    assert sorted(undamaged.members) == list(range(len(BRICKS)))
+    assert undamaged.differing == ()
 
 
 @pytest.mark.parametrize(
@@ -249,8 +249,8 @@ def test_the_end_of_a_joint_that_was_found_alone_is_a_fragment_of_it(
     (feature,) = joints_of(CLOUD, evidence, detections, measurements)
     fragments = fragments_of(CLOUD, evidence, detections, measurements, feature)
     assert fragments == ((len(BRICKS),) if is_fragment else ())
-    found, _ = joined(detections, measurements, [feature], fragments)
-    assert len(found) == (1 if is_fragment else 2)
+    remaining, _ = joined(detections, measurements, [feature], fragments)
+    assert len(remaining) == (1 if is_fragment else 2)
 
 
 def test_a_deeper_joint_has_no_damage_beside_it() -> None:

@@ -142,8 +142,8 @@ class Board:
         tube = wall * deep
         total = np.zeros(len(points))
         for depth in (np.arange(steps) + 0.5) / steps * tube:
-            at = points * (1.0 + depth / to_plane)
-            total += tube / steps * (self.passes(at, 0.0, depth) & self.within(at, depth))
+            floor_m = points * (1.0 + depth / to_plane)
+            total += tube / steps * (self.passes(floor_m, 0.0, depth) & self.within(floor_m, depth))
         end = points * (1.0 + tube / to_plane)
         floor = points * (1.0 + deep / to_plane)
         lit = self.passes(floor, 0.0, deep) & self.passes(floor, tube, deep)
@@ -276,8 +276,8 @@ def test_the_image_of_a_hole_is_that_of_rays_in_space(
     depth_mm: float,
     middle: tuple[float, float],
 ) -> None:
-    at = tuple((np.array([235.2, 130.4]) - middle) / FOCAL_PX * 0.75)
-    board = Board(diameter_mm, depth_mm, wall=0.6, middle=middle, at=at)
+    centre_m = tuple((np.array([235.2, 130.4]) - middle) / FOCAL_PX * 0.75)
+    board = Board(diameter_mm, depth_mm, wall=0.6, middle=middle, at=centre_m)
     patch, hole = patch_of(board)
     # perspective over a wide disc, three points for the wall's integral
     image = pictures(patch, hole[None])[0]
@@ -314,8 +314,8 @@ def test_a_nearly_noise_free_hole_or_bump_is_measured_exactly(
 def test_an_oblique_hole_has_the_diameter_and_the_place_of_its_mouth(
     diameter_mm: float, wall: float
 ) -> None:
-    at = tuple((np.array([235.2, 130.4]) - OBLIQUE) / FOCAL_PX * 0.75)
-    board = Board(diameter_mm, 30.0, wall=wall, middle=OBLIQUE, at=at)
+    centre_m = tuple((np.array([235.2, 130.4]) - OBLIQUE) / FOCAL_PX * 0.75)
+    board = Board(diameter_mm, 30.0, wall=wall, middle=OBLIQUE, at=centre_m)
     m = measured(board, 0.02, 1, threshold=100.0)
     floor = board.image > 0.5 * board.image.max()
     seen_m = 2 * np.sqrt(floor.sum() / np.pi * np.linalg.det(patch_of(board)[0].metric_m2) ** 0.5)
@@ -438,8 +438,8 @@ def test_the_lens_widens_the_picture_and_not_the_noise() -> None:
     board = Board(5.0, 12.7)
     board.image = cv2.GaussianBlur(board.image, (9, 9), 0.6)
     stated = HoleModelConfig(lens_px=0.6, linear_depth_mm=1e5)
-    known = measured(board, 0.005, 1, config=stated)
-    assert known.model_diameter_m == pytest.approx(5.0e-3, rel=0.02)
+    stated_blur = measured(board, 0.005, 1, config=stated)
+    assert stated_blur.model_diameter_m == pytest.approx(5.0e-3, rel=0.02)
     assert measured(board, 0.005, 1).model_diameter_m > 1.06 * 5.0e-3
     cloud, evidence = board.seen(0.005, 1)
     detection = strongest(cloud, evidence, 5.0)

@@ -406,8 +406,8 @@ def embedded(cloud: Cloud, evidence: Evidence, margins: tuple) -> tuple[Cloud, E
     """The same in a larger picture, whose other pixels are valid but not judged."""
 
     def padded(image: np.ndarray, value: float) -> np.ndarray:
-        further = ((0, 0),) * (image.ndim - 2)
-        return np.pad(image, (*margins, *further), constant_values=value)
+        no_padding = ((0, 0),) * (image.ndim - 2)
+        return np.pad(image, (*margins, *no_padding), constant_values=value)
 
     (top, bottom), (left, right) = margins
     region = cloud.region
@@ -470,11 +470,11 @@ def test_the_surface_at_a_hole_is_that_of_the_judged_pixels_around_it() -> None:
     points_m = np.where((ring & ~unjudged)[..., None], cloud.points_m, [7.0, 8.0, 9.0])
     points_m[gone] = np.nan
     elsewhere = replace(cloud, points_m=points_m)
-    other = measure_missing(
+    second = measure_missing(
         elsewhere, replace(evidence, score=score, surface_z_m=surface), detection
     )
-    np.testing.assert_allclose(other.extent_centre_m, expected.extent_centre_m, atol=2e-5)
-    assert other.extent_diameter_m == pytest.approx(expected.extent_diameter_m, rel=2e-3)
+    np.testing.assert_allclose(second.extent_centre_m, expected.extent_centre_m, atol=2e-5)
+    assert second.extent_diameter_m == pytest.approx(expected.extent_diameter_m, rel=2e-3)
     # each judged pixel of the ring counts: one that is off moves the centre
     for row, column in np.argwhere(ring & ~unjudged)[::5]:
         surface_z_m = evidence.surface_z_m.copy()
@@ -609,10 +609,10 @@ def test_the_tail_of_simulated_clusters_falls_like_a_geometric_distribution() ->
     # few clusters of one size: the slowest fall that is believed
     assert _tail(0.03, np.array([1, 1, 1]), 4).fall == pytest.approx(np.log(2.0))
     for count in (0, 1):
-        few = _tail(0.03, np.full(count, 5), 8)
-        assert few.size == 1
-        assert few.log_expected(1) == pytest.approx(np.log(1 / 8))
-        assert few.fall == pytest.approx(np.log(2.0))
+        small = _tail(0.03, np.full(count, 5), 8)
+        assert small.size == 1
+        assert small.log_expected(1) == pytest.approx(np.log(1 / 8))
+        assert small.fall == pytest.approx(np.log(2.0))
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 5])
@@ -636,16 +636,16 @@ def test_the_square_is_the_one_that_makes_as_many_missing_neighbours(rate, side)
     and the pairs of neighbours are as frequent as the bivariate normal distribution says."""
     level = ndtri(rate)
     low = np.stack([field < level for field in _fields((300, 400), side, 4)])
-    known = np.ones(low[0].shape, bool)
-    sides = [_square(image, known, rate) for image in low]
-    turned = [_square(image.T, known.T, rate) for image in low]
+    is_known = np.ones(low[0].shape, bool)
+    sides = [_square(image, is_known, rate) for image in low]
+    turned = [_square(image.T, is_known.T, rate) for image in low]
     assert turned == sides
     # two standard errors: one field in 40 has a larger square
     assert sorted(sides)[1] == sides[0] == side
     correlation = 1.0 - 1.0 / side
-    both = multivariate_normal.cdf([level, level], cov=[[1.0, correlation], [correlation, 1.0]])
+    joint = multivariate_normal.cdf([level, level], cov=[[1.0, correlation], [correlation, 1.0]])
     frequent = (low[:, 1:] & low[:, :-1]).mean()
-    assert frequent == pytest.approx(both, rel=0.05)
+    assert frequent == pytest.approx(joint, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -673,23 +673,23 @@ def test_a_larger_square_is_taken_beyond_two_standard_errors() -> None:
     """Of single pixels, the share of missing neighbours is the rate: a measured share of up to two
     of its standard errors more is chance."""
     image = np.random.default_rng(13).random((200, 300)) < 0.1
-    known = np.ones(image.shape, bool)
+    is_known = np.ones(image.shape, bool)
     pairs = image[:-1].sum() + image[:, :-1].sum()
-    both = (image[:-1] & image[1:]).sum() + (image[:, :-1] & image[:, 1:]).sum()
-    share = both / pairs
+    neighbours = (image[:-1] & image[1:]).sum() + (image[:, :-1] & image[:, 1:]).sum()
+    share = neighbours / pairs
     error = np.sqrt(share * (1.0 - share) / pairs)
     for sigmas, side in ((-1.0, 1), (1.9, 1), (2.1, 2), (3.9, 2)):
-        assert _square(image, known, share - sigmas * error) == side
+        assert _square(image, is_known, share - sigmas * error) == side
 
 
 def test_neighbours_that_are_not_known_do_not_count_as_returned() -> None:
     """Pairs with missing pixels that are findings say nothing on the dropouts' square."""
     field = next(_fields((300, 400), 3, 1))
     missing = field < ndtri(0.2)
-    known = np.ones(missing.shape, bool)
-    known[::4] = False
-    known[:, ::5] = False
-    assert _square(missing & known, known, 0.2) == 3
+    is_known = np.ones(missing.shape, bool)
+    is_known[::4] = False
+    is_known[:, ::5] = False
+    assert _square(missing & is_known, is_known, 0.2) == 3
 
 
 @pytest.mark.parametrize(

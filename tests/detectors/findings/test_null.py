@@ -143,9 +143,9 @@ def test_the_interval_of_counts_is_poissons_where_the_law_is_known() -> None:
     the lower end and the larger one the upper."""
     ends = {0.01: (0, 0), 1.0: (0, 3), 10.0: (4, 17), 300.0: (267, 334)}
     for expected, (fewest, most) in ends.items():
-        known = np.array([expected, expected])
-        assert _count_reaching(0.025, known) == fewest
-        assert _count_reaching(0.975, known) == most
+        certain = np.array([expected, expected])
+        assert _count_reaching(0.025, certain) == fewest
+        assert _count_reaching(0.975, certain) == most
     either = np.array([1.0, 10.0])
     # half of the probability is each law's: 2.5 % of all are 5 % of one
     assert _count_reaching(0.025, either) == 0

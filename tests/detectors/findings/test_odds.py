@@ -55,7 +55,7 @@ SLOW = pytest.mark.slow  # a Monte Carlo campaign over all kinds of noise
 def by_integration(scores: np.ndarray, density: np.ndarray, expected: float) -> np.ndarray:
     """Return what `share_of_noise` computes with one law, by adaptive quadrature over the number of
     real findings."""
-    most = 10.0 * (len(scores) + 1.0)
+    highest = 10.0 * (len(scores) + 1.0)
     evidence = 0.0
     sums = np.zeros(len(scores))
     for steepness in STEEPNESS:
@@ -67,17 +67,17 @@ def by_integration(scores: np.ndarray, density: np.ndarray, expected: float) -> 
             likelihood = np.prod(density + number * real)
             return float(prior * likelihood * np.exp(-expected - number))
 
-        ends = (np.log(0.01), np.log(most))
+        ends = (np.log(0.01), np.log(highest))
         evidence += integrate.quad(weight, *ends)[0]
-        for place in range(len(scores)):
+        for row in range(len(scores)):
 
             def share(
-                log_number: float, real: np.ndarray = real, place: int = place, weight=weight
+                log_number: float, real: np.ndarray = real, row: int = row, weight=weight
             ) -> float:
-                total = density[place] + np.exp(log_number) * real[place]
-                return float(weight(log_number) * density[place] / total)
+                total = density[row] + np.exp(log_number) * real[row]
+                return float(weight(log_number) * density[row] / total)
 
-            sums[place] += integrate.quad(share, *ends)[0]
+            sums[row] += integrate.quad(share, *ends)[0]
     return sums / evidence
 
 
@@ -99,8 +99,8 @@ def test_likely_laws_weigh_more() -> None:
     scores = np.array([6.0])
     likely = share_of_noise(scores, THRESHOLD, np.array([[0.2]]), np.array([0.1]))
     unlikely = np.array([[0.2], [1e6]])
-    both = share_of_noise(scores, THRESHOLD, unlikely, np.array([0.1, 1e6]))
-    assert both == pytest.approx(likely, rel=1e-9)
+    both_odds = share_of_noise(scores, THRESHOLD, unlikely, np.array([0.1, 1e6]))
+    assert both_odds == pytest.approx(likely, rel=1e-9)
 
 
 def test_stronger_findings_are_never_more_likely_noise() -> None:
@@ -198,8 +198,10 @@ def printed(seed: int, loud: float = 8.0) -> tuple[Cloud, np.ndarray]:
     print_m = np.zeros(shape)
     print_m[TAG] = 1.0
     edges = ndimage.binary_dilation(np.hypot(*np.gradient(print_m)) > 0, iterations=2)
-    places = np.flatnonzero(edges & ndimage.binary_erosion(np.ones(shape, bool), iterations=12))
-    chosen = random.choice(places, 10, replace=False)
+    edge_pixels = np.flatnonzero(
+        edges & ndimage.binary_erosion(np.ones(shape, bool), iterations=12)
+    )
+    chosen = random.choice(edge_pixels, 10, replace=False)
     errors_m = np.zeros(shape)
     errors_m.ravel()[chosen] = random.choice([-1.0, 1.0], 10) * random.uniform(0.5, 1.0, 10)
     blurred_m = ndimage.uniform_filter(errors_m, 3) * 9.0
@@ -216,47 +218,47 @@ def printed(seed: int, loud: float = 8.0) -> tuple[Cloud, np.ndarray]:
 
 def own_of(cloud: Cloud, name: str = "matched") -> tuple[OwnThreshold, tuple[Detection, ...]]:
     detector = load_detector(name, {"crop": {"kind": "none"}, "surface": {"degree": 1}})
-    own = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
-    return own, detector.find(cloud, own.evidence, own.threshold)
+    null = own_threshold(detector, cloud, detector.analyse(cloud), 1.0)
+    return null, detector.find(cloud, null.evidence, null.threshold)
 
 
 def test_calls_at_print_are_expected_there() -> None:
     """Ten errors of either sign at the edges of a print: those towards the camera predict those
     behind the surface, and away from the print nothing changes."""
     expected = 0.0
-    seen = 0
+    at_marks = 0
     away = 0
     captures = 6
     for seed in range(captures):
         cloud, edges = printed(seed)
-        own, found = own_of(cloud)
-        marks = marks_of(cloud, own.evidence)
-        near = grown(edges, marks.margin_px)
-        assert own.doubts == ()
-        assert own.expected - own.at_marks == pytest.approx(1.0, rel=1e-6)
-        expected += own.at_marks
-        for detection in found:
+        null, detections = own_of(cloud)
+        marks = marks_of(cloud, null.evidence)
+        beside_marks = grown(edges, marks.margin_px)
+        assert null.doubts == ()
+        assert null.expected - null.at_marks == pytest.approx(1.0, rel=1e-6)
+        expected += null.at_marks
+        for detection in detections:
             at_print = edges.reshape(-1)[detection.pixels].any()
             # noise may peak beside the print, within its margin
-            is_near = near.reshape(-1)[detection.pixels].any()
+            is_near = beside_marks.reshape(-1)[detection.pixels].any()
             assert at_print <= marks.hold(detection) <= is_near
-            seen += at_print
+            at_marks += at_print
             away += not at_print
     assert expected > 4.0 * captures
-    assert 0.6 < seen / expected < 1.5
+    assert 0.6 < at_marks / expected < 1.5
     # the hole in each, and the call that is asked for
     assert captures <= away <= 3 * captures
 
 
 def test_a_finding_at_print_is_more_likely_false() -> None:
     cloud, _ = printed(1)
-    own, found = own_of(cloud)
-    evidence = replace(own.evidence, notes={"own_null": null_facts(own)})
-    probabilities = noise_probabilities(cloud, evidence, found, None)
+    null, detections = own_of(cloud)
+    evidence = replace(null.evidence, notes={"own_null": null_facts(null)})
+    probabilities = noise_probabilities(cloud, evidence, detections, None)
     marks = marks_of(cloud, evidence)
     hole = int(np.ravel_multi_index(DOT, cloud.valid.shape))
     at_print = []
-    for detection, probability in zip(found, probabilities, strict=True):
+    for detection, probability in zip(detections, probabilities, strict=True):
         if hole in detection.pixels:
             # the dot in the picture is the hole itself
             assert marks.covered.reshape(-1)[hole]
@@ -280,24 +282,24 @@ def test_a_wide_hole_is_its_own_mark() -> None:
     assert not marks.hold(Detection(9.0, hole, np.zeros(3)))
     beside = np.flatnonzero(np.hypot(rows - 65, columns - 108) < 3.0)
     assert marks.hold(Detection(9.0, beside, np.zeros(3)))
-    apart = np.flatnonzero(np.hypot(rows - 65, columns - 120) < 3.0)
-    assert not marks.hold(Detection(9.0, apart, np.zeros(3)))
+    distant = np.flatnonzero(np.hypot(rows - 65, columns - 120) < 3.0)
+    assert not marks.hold(Detection(9.0, distant, np.zeros(3)))
 
 
 def test_small_marks_are_no_less_noisy() -> None:
     """The area of the dot counts for the law of noise though its peaks do not."""
     cloud, _ = printed(2)
-    own, _ = own_of(cloud)
-    marks = marks_of(cloud, own.evidence)
+    null, _ = own_of(cloud)
+    marks = marks_of(cloud, null.evidence)
     assert marks.count == 1
     height, width = cloud.valid.shape
     dot = ndimage.label(marks.covered)[0]
     dot_pixels = int((dot == dot[DOT]).sum())
     uncovered = int((~marks.covered).sum())
-    plain = own.tails[PLAIN]
+    plain = null.tails[PLAIN]
     assert plain.area_ratio == pytest.approx((uncovered + dot_pixels) / uncovered)
     bare = replace(plain, area_ratio=1.0)
-    ratio = plain.expected(own.threshold) / bare.expected(own.threshold)
+    ratio = plain.expected(null.threshold) / bare.expected(null.threshold)
     assert ratio == pytest.approx(plain.area_ratio)
     assert height * width > uncovered
 
@@ -347,9 +349,9 @@ def board(seed: int, loud: float, errors: int = 40) -> tuple[Cloud, np.ndarray]:
     depth_px = ndimage.distance_transform_cdt(inside, "chessboard")
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     offset_m = noise_m + 4e-3 * (np.hypot(rows - 75, columns - 95) < 4.0)
-    places = random.choice(np.flatnonzero(depth_px == 4), errors, replace=False)
-    for place in places:
-        row, column = np.unravel_index(place, shape)
+    rim_pixels = random.choice(np.flatnonzero(depth_px == 4), errors, replace=False)
+    for pixel in rim_pixels:
+        row, column = np.unravel_index(pixel, shape)
         bump = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 8.0)
         offset_m += random.choice([-1e-3, 1e-3]) * random.uniform(0.5, 1.0) * loud * bump
     offset_m[~inside] = np.nan
@@ -363,45 +365,48 @@ def test_a_loud_rim_does_not_raise_the_threshold_elsewhere() -> None:
     for seed in range(5):
         cloud, depth_px = board(seed, 10.0)
         quiet, _ = board(seed, 0.0)
-        own, found = own_of(cloud)
+        null, detections = own_of(cloud)
         plain, _ = own_of(quiet)
-        assert own.doubts == ()
-        assert own.rim_scale < 0.7
+        assert null.doubts == ()
+        assert null.rim_scale < 0.7
         assert plain.rim_scale == 1.0
-        assert own.threshold == pytest.approx(plain.threshold, rel=0.3)
-        assert own.expected == pytest.approx(1.0, rel=1e-6)
-        assert own.low < 1.0 < own.high
+        assert null.threshold == pytest.approx(plain.threshold, rel=0.3)
+        assert null.expected == pytest.approx(1.0, rel=1e-6)
+        assert null.low < 1.0 < null.high
         detector = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
-        whole = detector.analyse(cloud).score
-        assert np.array_equal(own.evidence.score[depth_px > 20], whole[depth_px > 20])
-        outermost = (depth_px == 5) & (whole > 0)
-        ratio = own.evidence.score[outermost] / whole[outermost]
-        assert ratio == pytest.approx(own.rim_scale, rel=1e-9)
+        unscaled = detector.analyse(cloud).score
+        assert np.array_equal(null.evidence.score[depth_px > 20], unscaled[depth_px > 20])
+        outermost = (depth_px == 5) & (unscaled > 0)
+        ratio = null.evidence.score[outermost] / unscaled[outermost]
+        assert ratio == pytest.approx(null.rim_scale, rel=1e-9)
         middle = int(np.ravel_multi_index((75, 95), cloud.valid.shape))
-        assert sum(middle in detection.pixels for detection in found) == 1
-        calls += len(found) - 1
+        assert sum(middle in detection.pixels for detection in detections) == 1
+        calls += len(detections) - 1
     assert calls <= 10
 
 
 def test_a_few_bumps_at_the_rim_are_no_loud_rim() -> None:
     cloud, _ = board(1, 8.0, errors=5)
-    own, found = own_of(cloud)
-    assert own.rim_scale == 1.0
-    assert RIM not in own.tails
-    assert len(found) >= 3
+    null, detections = own_of(cloud)
+    assert null.rim_scale == 1.0
+    assert RIM not in null.tails
+    assert len(detections) >= 3
 
 
 def test_calls_at_the_rim_are_weighed_by_its_law() -> None:
     cloud, depth_px = board(0, 10.0)
-    own, _ = own_of(cloud)
-    facts = null_facts(own)
-    score = own.threshold * 1.2
+    null, _ = own_of(cloud)
+    facts = null_facts(null)
+    score = null.threshold * 1.2
     at_rim = Detection(score, np.flatnonzero(depth_px == 4)[:3], np.zeros(3))
     away = Detection(score, np.flatnonzero(depth_px == 40)[:3], np.zeros(3))
 
     def probabilities() -> np.ndarray:
-        evidence = replace(own.evidence, notes={"own_null": facts})
-        alone = [noise_probabilities(cloud, evidence, (one,), None)[0] for one in (at_rim, away)]
+        evidence = replace(null.evidence, notes={"own_null": facts})
+        alone = [
+            noise_probabilities(cloud, evidence, (detection,), None)[0]
+            for detection in (at_rim, away)
+        ]
         return np.array(alone)
 
     before = probabilities()
@@ -410,14 +415,14 @@ def test_calls_at_the_rim_are_weighed_by_its_law() -> None:
     assert after[0] > before[0] + 0.1
     assert before[1] == after[1]
     # the law in scores of the evidence: it integrates to the number expected
-    rim = own.tails[RIM]
-    assert rim.scale == own.rim_scale
-    scores = np.linspace(own.threshold, 30.0 * own.threshold, 40001)
+    rim = null.tails[RIM]
+    assert rim.scale == null.rim_scale
+    scores = np.linspace(null.threshold, 30.0 * null.threshold, 40001)
     laws = rim.laws(200)
     integral = np.trapezoid(laws.densities(scores), scores, axis=1)
-    difference = laws.expected(own.threshold) - laws.expected(30.0 * own.threshold)
+    difference = laws.expected(null.threshold) - laws.expected(30.0 * null.threshold)
     assert integral == pytest.approx(difference, rel=1e-3)
-    assert rim.threshold(rim.expected(own.threshold)) == pytest.approx(own.threshold)
+    assert rim.threshold(rim.expected(null.threshold)) == pytest.approx(null.threshold)
 
 
 # ---------------------------------------------------------------- what is unknown

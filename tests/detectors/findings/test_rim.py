@@ -47,10 +47,10 @@ DEPTH_PX = outline_depth_px(np.ones(SHAPE, bool))
 def edge_errors(seed: int, deviations: tuple[float, ...]) -> np.ndarray:
     """Errors with these deviations by distance from the outline, alike over 3 x 3 pixels."""
     blocks = np.random.default_rng(seed).standard_normal((SHAPE[0] // 3 + 1, SHAPE[1] // 3 + 1))
-    alike = np.kron(blocks, np.ones((3, 3)))[: SHAPE[0], : SHAPE[1]]
+    block_noise = np.kron(blocks, np.ones((3, 3)))[: SHAPE[0], : SHAPE[1]]
     errors = np.zeros(SHAPE)
     for distance, deviation in enumerate(deviations, start=1):
-        errors += np.where(distance == DEPTH_PX, deviation * alike, 0.0)
+        errors += np.where(distance == DEPTH_PX, deviation * block_noise, 0.0)
     return errors
 
 
@@ -98,8 +98,8 @@ def test_damage_on_a_tenth_of_the_rim_does_not_count() -> None:
     clean = shown(values)
     damaged = values.copy()
     damaged[:8, 20:80] += 20.0
-    found = shown(damaged)
-    np.testing.assert_allclose(found, clean, atol=0.35)
+    pixels = shown(damaged)
+    np.testing.assert_allclose(pixels, clean, atol=0.35)
 
 
 def test_variances_do_not_grow_inwards() -> None:
@@ -112,8 +112,8 @@ def test_variances_do_not_grow_inwards() -> None:
 
 def test_too_few_pixels_show_nothing() -> None:
     depth_px = outline_depth_px(np.ones((20, 21), bool))
-    few = rim_variances(np.ones((20, 21), np.float32), depth_px, NOISE, 8.0, is_alone=True)
-    np.testing.assert_array_equal(few, np.zeros(8))
+    variances = rim_variances(np.ones((20, 21), np.float32), depth_px, NOISE, 8.0, is_alone=True)
+    np.testing.assert_array_equal(variances, np.zeros(8))
 
 
 def test_pixels_get_the_variance_of_their_distance() -> None:

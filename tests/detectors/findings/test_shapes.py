@@ -180,9 +180,9 @@ def test_a_dim_floor_does_not_narrow_a_hole_where_light_weighs() -> None:
     assert size.best.shape == "disc"
     assert abs(size.diameter_m - 10e-3) < 2.0 * size.diameter_se_m < 2e-3
     assert size.diameter_m == pytest.approx(10e-3, rel=0.04)
-    alike = sized(replace(by_light, brightness=0.0), start, ("disc",), BLURS[:1])
-    assert alike is not None
-    assert alike.diameter_m < 0.95 * 10e-3
+    unweighted = sized(replace(by_light, brightness=0.0), start, ("disc",), BLURS[:1])
+    assert unweighted is not None
+    assert unweighted.diameter_m < 0.95 * 10e-3
 
 
 def test_a_mixture_has_the_variance_within_and_between() -> None:
@@ -294,9 +294,9 @@ def test_a_slot_s_length_width_and_angle_lie_within_their_errors() -> None:
     for seed in range(24):
         white = np.random.default_rng(seed).standard_normal(clear_m.shape)
         noise_m = cv2.blur(white, (3, 3)) * 3.0 * 4e-4
-        seen = replace(patch, residual_m=clear_m + noise_m, noise_m=4e-4)
+        noisy = replace(patch, residual_m=clear_m + noise_m, noise_m=4e-4)
         fit = fit_hole(
-            seen,
+            noisy,
             19.0,
             18.0,
             4e-3,
@@ -306,7 +306,7 @@ def test_a_slot_s_length_width_and_angle_lie_within_their_errors() -> None:
             stretch=0.5,
             angle_rad=0.4,
         )
-        length_se_m, width_se_m, angle_se_rad = ShapeFit(fit, seen).slot_errors
+        length_se_m, width_se_m, angle_se_rad = ShapeFit(fit, noisy).slot_errors
         width_m = 2.0 * fit.radius_m
         pulls.append(
             [

@@ -46,15 +46,15 @@ def test_only_upsampled_depth_is_blurred_twice():
 def test_places_are_free_and_apart():
     free = np.zeros((100, 200), bool)
     free[20:80, 30:170] = True
-    places = places_apart(free, 12, 20.0, np.random.default_rng(1))
-    assert free[tuple(places.T)].all()
-    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
-    assert distances[~np.eye(len(places), dtype=bool)].min() > 20.0
-    assert len(places) == 12
+    centres = places_apart(free, 12, 20.0, np.random.default_rng(1))
+    assert free[tuple(centres.T)].all()
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    assert distances[~np.eye(len(centres), dtype=bool)].min() > 20.0
+    assert len(centres) == 12
     # no more fit, and the same stream draws the same places
     crowded = places_apart(free, 1000, 20.0, np.random.default_rng(1))
     assert len(crowded) < 60
-    np.testing.assert_array_equal(crowded[:12], places)
+    np.testing.assert_array_equal(crowded[:12], centres)
     assert places_apart(np.zeros((5, 5), bool), 3, 2.0, np.random.default_rng(1)).shape == (0, 2)
 
 

@@ -122,28 +122,28 @@ def test_unknown_pixels_are_filled_as_by_the_reference(image_shape, grid_shape, 
 def test_a_solution_is_that_of_the_dense_covariance_of_the_known_pixels(
     side: int, added: np.ndarray | None
 ) -> None:
-    known = np.random.default_rng(6).random(SHAPE) > 0.1
-    known[10:14, 8:12] = False
+    is_known = np.random.default_rng(6).random(SHAPE) > 0.1
+    is_known[10:14, 8:12] = False
     by_lag = noise_covariance(
         blurred(3, (90, 120), side),
         np.ones((90, 120), bool),
         (128, 160),
     )
-    values = np.where(known, blurred(1, SHAPE, side), np.float32(0.0))
-    solved = inverse_times(values, known, filters(by_lag, SHAPE), error=0.01, added=added)
-    dense = dense_of(known, by_lag, grid_of(SHAPE))
+    values = np.where(is_known, blurred(1, SHAPE, side), np.float32(0.0))
+    solved = inverse_times(values, is_known, filters(by_lag, SHAPE), error=0.01, added=added)
+    dense = dense_of(is_known, by_lag, grid_of(SHAPE))
     if added is not None:
-        dense += np.diag(added[known])
+        dense += np.diag(added[is_known])
     else:
         product = covariance_product(solved, filters(by_lag, SHAPE))
-        np.testing.assert_allclose(product[known], values[known], atol=0.05)
-    expected = np.linalg.solve(dense, values[known])
+        np.testing.assert_allclose(product[is_known], values[is_known], atol=0.05)
+    expected = np.linalg.solve(dense, values[is_known])
     np.testing.assert_allclose(
-        solved[known],
+        solved[is_known],
         expected,
         atol=0.02 * np.abs(expected).max(),
     )
-    assert not solved[~known].any()
+    assert not solved[~is_known].any()
 
 
 class PlainDescent:
@@ -225,40 +225,40 @@ def test_a_descent_takes_the_steps_of_a_plain_one(is_ragged, error, is_started) 
     """Steps by another preconditioner end elsewhere within the error, so that the descent is the
     described one if the solutions are equal to rounding, also long before it has converged."""
     random = np.random.default_rng(8)
-    known = np.ones((70, 64), bool)
+    is_known = np.ones((70, 64), bool)
     if is_ragged:
-        known = np.hypot(*(np.indices(known.shape) - 32.0)) < 26.0 + 6.0 * random.random(
-            known.shape
+        is_known = np.hypot(*(np.indices(is_known.shape) - 32.0)) < 26.0 + 6.0 * random.random(
+            is_known.shape
         )
-        known &= random.random(known.shape) > 0.05
+        is_known &= random.random(is_known.shape) > 0.05
     by_lag = noise_covariance(
         blurred(3, (90, 120), 3),
         np.ones((90, 120), bool),
         (128, 160),
     )
-    values = np.where(known, blurred(1, known.shape, 3), np.float32(0.0))
+    values = np.where(is_known, blurred(1, is_known.shape, 3), np.float32(0.0))
     start = None
-    begun = np.zeros(known.shape)
+    begun = np.zeros(is_known.shape)
     if is_started:
         start = (values * np.float32(0.5)).astype(np.float32)
         begun = start
-    solved = inverse_times(values, known, filters(by_lag, known.shape), start, error)
-    expected, steps = PlainDescent(known, by_lag).solution(values, begun, error, 80)
+    solved = inverse_times(values, is_known, filters(by_lag, is_known.shape), start, error)
+    expected, steps = PlainDescent(is_known, by_lag).solution(values, begun, error, 80)
     assert 2 < steps < 80
     np.testing.assert_allclose(solved, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_a_solution_goes_on_from_another() -> None:
-    known = np.random.default_rng(6).random(SHAPE) > 0.1
+    is_known = np.random.default_rng(6).random(SHAPE) > 0.1
     by_lag = noise_covariance(
         blurred(3, (90, 120)),
         np.ones((90, 120), bool),
         (128, 160),
     )
-    values = np.where(known, blurred(1, SHAPE), np.float32(0.0))
+    values = np.where(is_known, blurred(1, SHAPE), np.float32(0.0))
     noise_filters = filters(by_lag, SHAPE)
-    solved = inverse_times(values, known, noise_filters, error=0.01)
-    again = inverse_times(values, known, noise_filters, solved)
+    solved = inverse_times(values, is_known, noise_filters, error=0.01)
+    again = inverse_times(values, is_known, noise_filters, solved)
     # nothing is left to do
     np.testing.assert_array_equal(again, solved)
 
@@ -268,25 +268,25 @@ def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
     holds: closely if solved to a small error, and within twice the error that `CONVERGED` states.
     """
     noise = blurred(1, SHAPE)
-    known = np.random.default_rng(2).random(SHAPE) > 0.1
+    is_known = np.random.default_rng(2).random(SHAPE) > 0.1
     by_lag = noise_covariance(
         blurred(3, (90, 120)),
         np.ones((90, 120), bool),
         (128, 160),
     )
-    dense = dense_of(known, by_lag, grid_of(SHAPE))
+    dense = dense_of(is_known, by_lag, grid_of(SHAPE))
     assert window_of(by_lag) == BLUR_PX
-    values = np.where(known, noise, np.float32(0.0))
+    values = np.where(is_known, noise, np.float32(0.0))
     noise_filters = filters(by_lag, SHAPE)
-    solved = inverse_times(values, known, noise_filters, error=0.01)
-    rough = inverse_times(values, known, noise_filters)
+    solved = inverse_times(values, is_known, noise_filters, error=0.01)
+    rough = inverse_times(values, is_known, noise_filters)
     all_worths = worths(spectrum(by_lag, (GRID, GRID)), BLUR_PX)
     for drawn, worth in zip(bank(BLUR_PX)[:10], all_worths, strict=False):
         half = len(drawn.image) // 2
         template = np.pad(drawn.image, 20)[half + 7 : half + 33, half + 5 : half + 35]
-        whitened = np.linalg.solve(dense, template[known])
-        energy = float(template[known] @ whitened)
-        exact = reference.score(template[known], noise[known], dense)
+        whitened = np.linalg.solve(dense, template[is_known])
+        energy = float(template[is_known] @ whitened)
+        exact = reference.score(template[is_known], noise[is_known], dense)
         score = (template * solved).sum() / energy**0.5
         assert score == pytest.approx(exact, rel=0.02, abs=0.02)
         assert abs((template * rough).sum() / energy**0.5 - exact) < 2.0 * CONVERGED

@@ -56,8 +56,8 @@ def test_whitened_noise_is_independent_with_a_deviation_near_1():
     stream = np.random.default_rng(7)
     white = stream.standard_normal((124, 164))
     blurred = sum(white[i : i + 120, j : j + 160] for i in range(5) for j in range(5)) / 25
-    known = np.ones(blurred.shape, np.float32)
-    whitened = detector.whitened(1e-3 * blurred, known, (0.0, 0.0))
+    weights = np.ones(blurred.shape, np.float32)
+    whitened = detector.whitened(1e-3 * blurred, weights, (0.0, 0.0))
     inner = whitened.values[20:-20, 20:-20]
     assert 0.75 < np.std(inner) < 1.05
     beside = np.mean(inner[:, 1:] * inner[:, :-1])
@@ -67,12 +67,12 @@ def test_whitened_noise_is_independent_with_a_deviation_near_1():
 
 def test_small_residuals_keep_their_size_and_large_ones_grow_slowly():
     values = np.array([[0.5, -0.5, 400.0]], np.float32)
-    known = np.array([[True, True, True]])
-    pictures = seen_by_network(values, known, 1.0)
+    is_known = np.array([[True, True, True]])
+    pictures = seen_by_network(values, is_known, 1.0)
     np.testing.assert_allclose(pictures[0, 0, :2], [0.5, -0.5], rtol=0.01)
     assert 10.0 < pictures[0, 0, 2] < 30.0
-    np.testing.assert_array_equal(seen_by_network(values, known, -1.0)[0], -pictures[0])
-    hidden = seen_by_network(values, ~known, 1.0)
+    np.testing.assert_array_equal(seen_by_network(values, is_known, -1.0)[0], -pictures[0])
+    hidden = seen_by_network(values, ~is_known, 1.0)
     assert not hidden.any()
 
 
@@ -81,9 +81,9 @@ def test_a_score_is_the_root_of_twice_the_logarithm_of_the_likelihood_ratio(tmp_
     cloud = damaged()
     evidence = detector.analyse(cloud)
     whitened = detector.whitened(*detector.picture(cloud).residuals)
-    seen = seen_by_network(whitened.values, whitened.known, 1.0)[0]
+    inputs = seen_by_network(whitened.values, whitened.known, 1.0)[0]
     row, column = 42, 52
-    log_ratio = float(seen[row - 1 : row + 2, column - 1 : column + 2].sum())
+    log_ratio = float(inputs[row - 1 : row + 2, column - 1 : column + 2].sum())
     expected = np.sqrt(2 * np.log1p(np.exp(log_ratio)))
     assert evidence.score[row, column] == pytest.approx(expected, rel=0.05)
     assert evidence.score[row, column] <= expected
@@ -94,8 +94,8 @@ def test_what_lies_in_front_is_judged_as_what_lies_behind(tmp_path):
     detector = detector_of(sum_of_nine(tmp_path / "n.npz"))
     cloud = damaged()
     evidence = detector.analyse(cloud)
-    found = detector.find(cloud, evidence, 8.0)
-    assert len(found) == 2
+    detections = detector.find(cloud, evidence, 8.0)
+    assert len(detections) == 2
     assert evidence.behind is not None
     assert evidence.behind[HOLE].all()
     assert not evidence.behind[BUMP].any()
@@ -113,8 +113,8 @@ def test_a_side_lobe_beside_stronger_evidence_is_no_finding(tmp_path):
         residual_m[30:33, 30:33] = 1e-2
         residual_m[30:33, 30 + distance : 33 + distance] = -7e-3
         noise_m = 1e-3 * np.random.default_rng(8).standard_normal((60, 60))
-        known = np.ones((60, 60), np.float32)
-        signed, _, _ = detector.scored(residual_m + noise_m, known, (0.0, 0.0), 1.0)
+        weights = np.ones((60, 60), np.float32)
+        signed, _, _ = detector.scored(residual_m + noise_m, weights, (0.0, 0.0), 1.0)
         scores[distance] = signed[31, 31 + distance]
         assert signed[31, 31] > 8.0
     assert scores[12] < -5.0
@@ -131,8 +131,8 @@ def test_a_learned_covariance_whitens(tmp_path):
     residuals = detector.picture(cloud).residuals
     inner = np.s_[10:-10, 10:-10]
     half = fourfold.whitened(*residuals).values[inner]
-    whole = calibrated.whitened(*residuals).values[inner]
-    np.testing.assert_allclose(2 * half, whole, atol=0.05 * whole.max())
+    single = calibrated.whitened(*residuals).values[inner]
+    np.testing.assert_allclose(2 * half, single, atol=0.05 * single.max())
 
 
 def test_the_network_of_another_content_is_refused(tmp_path):

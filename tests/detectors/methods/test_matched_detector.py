@@ -306,8 +306,8 @@ def stepped(seed: int) -> np.ndarray:
     depths = (rows, SHAPE[0] - 1 - rows, columns, SHAPE[1] - 1 - columns)
     along = (columns, columns, rows, rows)
     errors = np.zeros(SHAPE)
-    for depth, place, run in zip(depths, along, runs, strict=True):
-        errors += np.select([depth == 0, depth == 1, depth == 2], [2.0, 0.8, 0.3], 0.0) * run[place]
+    for depth, start, run in zip(depths, along, runs, strict=True):
+        errors += np.select([depth == 0, depth == 1, depth == 2], [2.0, 0.8, 0.3], 0.0) * run[start]
     return errors
 
 
@@ -341,9 +341,9 @@ def test_the_errors_of_an_edge_are_no_damage(learns: bool) -> None:
     assert np.mean(aware) < np.mean(plain) + 1.0
     assert np.mean(misled) > np.mean(plain) + 2.0
     deep = hole(5, 45, 3.0, 0.004) + 3e-4 * (smooth(30) + stepped(30))
-    found = detector.find(cloud_of(deep), detector.analyse(cloud_of(deep)), 6.0)
-    places = [np.unravel_index(detection.pixels[0], SHAPE) for detection in found]
-    assert any(np.hypot(row - 45, column - 5) < 8.0 for row, column in places)
+    detections = detector.find(cloud_of(deep), detector.analyse(cloud_of(deep)), 6.0)
+    centres = [np.unravel_index(detection.pixels[0], SHAPE) for detection in detections]
+    assert any(np.hypot(row - 45, column - 5) < 8.0 for row, column in centres)
 
 
 def test_local_means_count_the_errors_of_an_edge_as_noise(monkeypatch) -> None:
@@ -388,11 +388,11 @@ def test_the_core_of_a_strong_finding_is_what_is_loud_in_its_disc() -> None:
     scores = 20.0 * inside.astype(np.float32)
     is_known = np.ones(values.shape, bool)
     (core,) = _cores(scores, np.full(values.shape, 4.5), values, is_known)
-    found = np.zeros(values.shape)
-    found[core.cut][core.inside] = core.signed
-    assert (found[inside] > 0.3 * 20.0).all()
-    assert not found[~grown(inside, 1)].any()
-    assert found.max() == pytest.approx(20.0)
+    expected = np.zeros(values.shape)
+    expected[core.cut][core.inside] = core.signed
+    assert (expected[inside] > 0.3 * 20.0).all()
+    assert not expected[~grown(inside, 1)].any()
+    assert expected.max() == pytest.approx(20.0)
     assert inside[core.peak]
     # loud pixels that fill less than half of the template's disc are not its finding
     assert not _cores(scores, np.full(values.shape, 9.0), values, is_known)

@@ -75,9 +75,9 @@ def test_a_turned_or_mirrored_picture_gives_turned_or_mirrored_odds():
 def test_strips_give_what_the_whole_picture_gives(monkeypatch, height):
     """With 28 rows to a strip, four times the reach of 7."""
     pictures = np.random.default_rng(6).standard_normal((2, height, 20)).astype(np.float32)
-    whole = GOOD.log_odds(pictures)
+    expected = GOOD.log_odds(pictures)
     monkeypatch.setattr("detectors.methods.network.STRIP_PIXELS", 1)
-    np.testing.assert_allclose(GOOD.log_odds(pictures), whole, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(GOOD.log_odds(pictures), expected, rtol=1e-5, atol=1e-4)
 
 
 def test_a_network_comes_back_from_its_file(tmp_path):
@@ -93,8 +93,8 @@ def stored(path: Path, stated: dict, changed: dict) -> Path:
     write_network(path, GOOD)
     with np.load(path) as archive:
         arrays = dict(archive)
-    known = json.loads(str(arrays["facts"]))
-    arrays["facts"] = np.array(json.dumps({**known, **stated}))
+    facts = json.loads(str(arrays["facts"]))
+    arrays["facts"] = np.array(json.dumps({**facts, **stated}))
     arrays.update(changed)
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
     return path

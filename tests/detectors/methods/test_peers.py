@@ -143,12 +143,12 @@ def test_m3c2_is_the_formula_of_its_paper() -> None:
     points = cloud.points_m.reshape(-1, 3)
     surface = evidence.surface_z_m.ravel()
     for row, column in ((45, 60), (20, 31), (37, 20), (59, 81)):
-        place = row * 120 + column
-        vicinity = np.hypot(*(points[:, :2] - points[place, :2]).T) < 4e-3
+        pixel = row * 120 + column
+        vicinity = np.hypot(*(points[:, :2] - points[pixel, :2]).T) < 4e-3
         behind_m = points[vicinity, 2] - surface[vicinity]
         error_m = behind_m.std(ddof=1) / np.sqrt(vicinity.sum()) + 2e-4
         # the plane's normal is the optical axis to a thousandth
-        assert evidence.score.ravel()[place] == pytest.approx(
+        assert evidence.score.ravel()[pixel] == pytest.approx(
             abs(behind_m.mean()) / error_m,
             rel=0.03,
             abs=0.02,

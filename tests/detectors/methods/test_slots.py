@@ -80,8 +80,8 @@ def test_a_slot_is_found_with_its_size_and_place(
     nearest = min(SLOTS_DEG, key=lambda deg: abs((deg - angle_deg + 90.0) % 180.0 - 90.0))
     start = SlotSides(SLOT_LENGTHS_PX[1], SLOT_WIDTH_PX, nearest)
     energies = slots.energies(WHITE, 1)
-    place = (MIDDLE[0] + 1.2, MIDDLE[1] - 0.8)
-    slot = slots.best_slot(slots.blurred(picture, 1), energies, place, start, sign)
+    centre = (MIDDLE[0] + 1.2, MIDDLE[1] - 0.8)
+    slot = slots.best_slot(slots.blurred(picture, 1), energies, centre, start, sign)
     exact = math.sqrt((picture**2).sum())
     assert 0.96 * exact < sign * slot.score < 1.02 * exact
     assert slot.length_px == pytest.approx(length_px, rel=0.26)

@@ -246,8 +246,8 @@ def plate_without_discs(seed: int) -> np.ndarray:
     outline = [(20, 48), (80, 38), (45, 8), (55, 88), (80, 73), (20, 73)]
     for row, column in outline:
         towards_middle = np.sign([50 - row, 48 - column]) * random.uniform(0.0, 6.0)
-        at = np.array([row, column]) + towards_middle
-        plate &= np.hypot(v - at[0], u - at[1]) > random.uniform(2.0, 14.0)
+        point = np.array([row, column]) + towards_middle
+        plate &= np.hypot(v - point[0], u - point[1]) > random.uniform(2.0, 14.0)
     return np.asarray(ndimage.binary_fill_holes(plate))
 
 
@@ -310,8 +310,8 @@ def test_a_camera_at_the_origin_sees_points_before_it_at_less_than_80_degrees(
     point, is_before
 ) -> None:
     assert np.degrees(np.arctan(WIDEST_SLOPE)) == pytest.approx(80.0, abs=0.1)
-    others = rough_points(2)
-    assert _before_lens(others)
-    others[4, 5] = point
-    assert _before_lens(others) == is_before
+    second_draw = rough_points(2)
+    assert _before_lens(second_draw)
+    second_draw[4, 5] = point
+    assert _before_lens(second_draw) == is_before
     assert not _before_lens(np.full((3, 4, 3), np.nan))

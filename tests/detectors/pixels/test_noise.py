@@ -332,10 +332,10 @@ def test_a_cloud_knows_the_sides_of_upsampled_noise_alone() -> None:
         z_step_m=0.0,
         n_frames=5,
     )
-    known = with_noise(cloud, frames, 0.0)
-    assert noise_sides_at(known, 240, 100)[0] == pytest.approx(9.0, abs=1.0)
-    assert noise_sides_at(known, 240, 900)[0] == pytest.approx(20.0, abs=2.5)
-    between = noise_sides_at(known, 240, 480)[0]
+    measured = with_noise(cloud, frames, 0.0)
+    assert noise_sides_at(measured, 240, 100)[0] == pytest.approx(9.0, abs=1.0)
+    assert noise_sides_at(measured, 240, 900)[0] == pytest.approx(20.0, abs=2.5)
+    between = noise_sides_at(measured, 240, 480)[0]
     assert 10.0 < between < 19.0
     native = with_noise(cloud, frames_of(5, 5, shape=(480, 960)), 0.0)
     assert native.noise_sides_px is None

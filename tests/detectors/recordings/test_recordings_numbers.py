@@ -159,19 +159,19 @@ def test_the_colour_lens_by_hand(is_wide: bool) -> None:
 @pytest.mark.parametrize("key", ["size", "name"])
 def test_of_several_lenses_that_of_the_size_or_of_depth_is_taken(tmp_path: Path, key: str) -> None:
     lens = {"fx": 100.0, "fy": 101.0, "cx": 47.0, "cy": 35.0}
-    other = {"fx": 130.0, "fy": 131.0, "cx": 48.0, "cy": 36.0}
+    factory_lens = {"fx": 130.0, "fy": 131.0, "cx": 48.0, "cy": 36.0}
     if key == "size":
         content = {
-            "a": {**other, "width": 192, "height": 144},
+            "a": {**factory_lens, "width": 192, "height": 144},
             "b": {**lens, "width": 96, "height": 72},
         }
     else:
-        content = {"colour": other, "depth_camera": lens}
+        content = {"colour": factory_lens, "depth_camera": lens}
     path = tmp_path / "lenses.json"
     path.write_text(json.dumps(content))
     result = read_lens(path, 96, 72)
     assert (result.fx, result.fy, result.cx, result.cy) == (100.0, 101.0, 47.0, 35.0)
-    path.write_text(json.dumps({"left": other, "right": lens}))
+    path.write_text(json.dumps({"left": factory_lens, "right": lens}))
     with pytest.raises(UserError, match=r"holds 2 different lenses \(left, right\)"):
         read_lens(path, 96, 72)
     path.write_text(json.dumps({"left": lens, "right": lens}))
@@ -413,9 +413,9 @@ def test_points_of_a_sensors_size_fill_its_grid_if_enough_are_valid(valid, has_g
     v, u = np.divmod(np.arange(160 * 120), 160)
     z = np.full(len(u), 0.9)
     points = np.stack([0.002 * (u - 80) * z, 0.003 * (v - 60) * z, z], axis=1)
-    few = points.copy()
-    few[np.random.default_rng(5).permutation(len(u))[valid:]] = 0.0
-    assert _grid_of(few) == ((120, 160) if has_grid else (1, 19_200))
+    sparse = points.copy()
+    sparse[np.random.default_rng(5).permutation(len(u))[valid:]] = 0.0
+    assert _grid_of(sparse) == ((120, 160) if has_grid else (1, 19_200))
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -505,8 +505,8 @@ def test_cameras_that_all_store_millimetres_do_so_within_their_range(size, farth
     usual = 0.867 * 1.05
     for median_m, expected in ((farthest_m - 0.01, 10 * usual), (farthest_m + 0.01, 0.0)):
         assert _weight("mm", 800.0, 1e3 * median_m, size, 1) == pytest.approx(expected)
-    other = (size[0] + 1, size[1])
-    assert _weight("mm", 800.0, 1e3 * farthest_m, other, 1) == pytest.approx(usual)
+    taller = (size[0] + 1, size[1])
+    assert _weight("mm", 800.0, 1e3 * farthest_m, taller, 1) == pytest.approx(usual)
     quarter = _weight("4000/m", 3200.0, 4e3 * farthest_m, size, 1)
     assert quarter == pytest.approx(0.08 * 1.05)
 
@@ -518,8 +518,8 @@ def test_cameras_that_all_store_millimetres_do_so_within_their_range(size, farth
 def test_sizes_of_the_l515_and_its_colour_favour_a_quarter_of_a_millimetre(size, factor) -> None:
     usual = 0.08 * 1.05
     assert _weight("4000/m", 3200.0, 4000.0, size, 1) == pytest.approx(factor * usual)
-    other = (size[0], size[1] + 1)
-    assert _weight("4000/m", 3200.0, 4000.0, other, 1) == pytest.approx(usual)
+    wider = (size[0], size[1] + 1)
+    assert _weight("4000/m", 3200.0, 4000.0, wider, 1) == pytest.approx(usual)
     assert _weight("mm", 800.0, 1000.0, size, 1) == pytest.approx(0.867 * 1.05)
 
 
@@ -883,8 +883,10 @@ def test_depth_pictures_are_sorted_by_their_numbers() -> None:
     paths = [Path(f"{name}.png") for name in names]
     chosen = depth_named(paths, paths)
     assert [path.stem for path in chosen] == ["depth_9", "depth_9.5", "depth_10", "depth_100"]
-    others = [Path(f"{name}.png") for name in ("b12", "b2", "ir_1", "b_mask", "b3_conf", "air1")]
-    assert [path.stem for path in depth_named(others, others)] == ["air1", "b2", "b12"]
+    candidates = [
+        Path(f"{name}.png") for name in ("b12", "b2", "ir_1", "b_mask", "b3_conf", "air1")
+    ]
+    assert [path.stem for path in depth_named(candidates, candidates)] == ["air1", "b2", "b12"]
 
 
 def test_the_kind_of_a_png_stands_in_its_header(tmp_path: Path) -> None:

@@ -512,8 +512,8 @@ def test_points_that_are_no_place_before_a_camera_are_left_out(tmp_path: Path) -
     path = plane.write_pcd(tmp_path / "a.pcd", points)
     recording = open_capture([path])
     (frame,) = recording.frames()
-    for place in ((10, 10), (30, 30)):
-        assert frame.reason[place] == Reason.OUT_OF_RANGE and np.isnan(frame.z_m[place])
+    for pixel in ((10, 10), (30, 30)):
+        assert frame.reason[pixel] == Reason.OUT_OF_RANGE and np.isnan(frame.z_m[pixel])
     assert frame.reason[40, 40] == Reason.VALID, "86.8 degrees aside"
     assert any("no place before a camera are left out" in note for note in recording.notes)
 

@@ -52,10 +52,10 @@ def test_distances_and_levels_are_those_of_py4dgeo() -> None:
         max_distance=50 * MM,
     )
     distance_m, uncertainty = oracle.run()
-    found = compared(earlier_m, later_m, np.asarray(oracle.directions()))
-    assert found.common_m == 0.0
-    np.testing.assert_allclose(found.distance_m, distance_m, atol=1e-12)
-    np.testing.assert_allclose(found.lod_m, uncertainty["lodetection"], atol=1e-12)
+    measured = compared(earlier_m, later_m, np.asarray(oracle.directions()))
+    assert measured.common_m == 0.0
+    np.testing.assert_allclose(measured.distance_m, distance_m, atol=1e-12)
+    np.testing.assert_allclose(measured.lod_m, uncertainty["lodetection"], atol=1e-12)
 
 
 def test_an_unchanged_sheet_is_within_its_level_and_a_change_is_not() -> None:
@@ -74,9 +74,9 @@ def test_what_unchanged_places_differ_by_widens_the_level() -> None:
     later_m = sheet(4000)
     # a pattern 20 mm long that no scatter in a cylinder shows
     later_m[:, 2] += 0.4 * MM * np.sin(later_m[:, 0] / (20 * MM) * 2 * np.pi)
-    found = compared(earlier_m, later_m)
-    assert found.common_m == pytest.approx(0.4 / np.sqrt(2) * MM, rel=0.35)
-    assert found.is_significant.mean() < 0.05
+    measured = compared(earlier_m, later_m)
+    assert measured.common_m == pytest.approx(0.4 / np.sqrt(2) * MM, rel=0.35)
+    assert measured.is_significant.mean() < 0.05
 
 
 def test_shared_noise_counts_once() -> None:
@@ -88,6 +88,6 @@ def test_shared_noise_counts_once() -> None:
 
 
 def test_a_place_with_few_points_is_not_judged() -> None:
-    found = compared(sheet(4000), sheet(60))
-    assert np.isnan(found.distance_m).mean() > 0.9
-    assert not found.is_significant[np.isnan(found.distance_m)].any()
+    measured = compared(sheet(4000), sheet(60))
+    assert np.isnan(measured.distance_m).mean() > 0.9
+    assert not measured.is_significant[np.isnan(measured.distance_m)].any()

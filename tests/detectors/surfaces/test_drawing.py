@@ -155,9 +155,9 @@ def test_a_wrong_unit_and_a_wrong_part_are_told(tmp_path: Path) -> None:
     trimesh.load(path).apply_scale(1e-3).export(metres)
     with pytest.raises(
         UserError, match=r"is 0\.\d+ mm large in mm, and the target 2\d\d mm"
-    ) as told:
+    ) as raised:
         drawing_under(read_drawing(DrawingFile(file=str(metres))), points, central=True)
-    assert told.value.fix == "state its unit, if it is m: reference.unit=m"
+    assert raised.value.fix == "state its unit, if it is m: reference.unit=m"
     with pytest.raises(UserError, match="mm large in m, and the target"):
         drawing_under(read_drawing(DrawingFile(file=str(path), unit="m")), points, central=True)
     ball = tmp_path / "ball.stl"

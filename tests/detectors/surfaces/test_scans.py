@@ -25,10 +25,10 @@ T_EARLIER_NOW = pose() @ invert(TURNED)
 
 def test_a_part_is_placed_within_the_stated_error() -> None:
     cloud, mask = cloud_of(MadePart(), TURNED, seed=2)
-    found = placed(SCAN, cloud.points_m[mask], 1.0, True, None)
-    middle_m = transform_points(invert(T_EARLIER_NOW), found.middle_m)
-    error_m = transform_points(found.T_part_camera, middle_m) - found.middle_m
-    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    pose = placed(SCAN, cloud.points_m[mask], 1.0, True, None)
+    middle_m = transform_points(invert(T_EARLIER_NOW), pose.middle_m)
+    error_m = transform_points(pose.T_part_camera, middle_m) - pose.middle_m
+    stated_m = np.sqrt(np.diag(pose.covariance))[3:]
     assert (np.abs(error_m) < 4 * stated_m).all()
     # a hundredth of a pixel along the plate, less than a tenth of the noise across it
     assert (stated_m[:2] < 0.02 * MM).all() and stated_m[2] < 0.004 * MM
@@ -59,8 +59,8 @@ def test_a_flat_plate_is_known_to_a_pixel_along_itself() -> None:
     flat = MadePart(has_ribs=False)
     earlier, mask = cloud_of(flat, pose(), seed=3)
     cloud, now = cloud_of(flat, TURNED, seed=4)
-    found = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, None)
-    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    by_outline = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, None)
+    stated_m = np.sqrt(np.diag(by_outline.covariance))[3:]
     pixel_m = made_parts.DISTANCE_M / made_parts.LENS.fx
     assert stated_m[:2] == pytest.approx([pixel_m] * 2, rel=0.2)
     assert stated_m[2] < 0.005 * MM
@@ -72,11 +72,11 @@ def test_marks_place_what_the_surface_does_not() -> None:
     cloud, now = cloud_of(flat, TURNED, seed=4)
     covariance = np.diag([1e-3**2] * 3 + [(0.1 * MM) ** 2] * 3)
     marks = KnownPose(T_EARLIER_NOW, covariance, earlier.points_m[mask].mean(axis=0))
-    found = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, marks)
-    stated_m = np.sqrt(np.diag(found.covariance))[3:]
+    by_marks = placed(scan_of(earlier, mask, "flat"), cloud.points_m[now], 1.0, True, marks)
+    stated_m = np.sqrt(np.diag(by_marks.covariance))[3:]
     assert stated_m[:2] == pytest.approx([0.1 * MM] * 2, rel=0.1)
     assert stated_m[2] < 0.005 * MM  # by the surface
-    shift_m = (found.T_part_camera @ invert(T_EARLIER_NOW))[:3, 3]
+    shift_m = (by_marks.T_part_camera @ invert(T_EARLIER_NOW))[:3, 3]
     assert np.abs(shift_m).max() < 0.2 * MM
 
 
@@ -145,9 +145,9 @@ def test_mistakes_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
         laid_under(scan_of(flat, corner, "corner"), flat, mask)
     line = np.zeros_like(mask)
     line[60, 26:123] = True
-    few = np.zeros_like(mask)
-    few[60:63, 60:100] = True
-    for seen_part in (line, few):
+    small_mask = np.zeros_like(mask)
+    small_mask[60:63, 60:100] = True
+    for seen_part in (line, small_mask):
         with pytest.raises(UserError, match=r"piece: \d+ points of the part span no surface"):
             scan_of(flat, seen_part, "piece")
     in_metres = replace(EARLIER, points_m=1e3 * EARLIER.points_m)

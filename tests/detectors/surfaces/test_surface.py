@@ -239,10 +239,10 @@ def test_too_few_or_degenerate_points_are_a_clear_mistake() -> None:
     x, y, z = cloud(10)
     for degree, cross, terms in ((3, True, 10), (3, False, 7), (2, True, 6), (1, False, 3)):
         settings = {"degree": degree, "drop_cross_terms": not cross, "method": "least_squares"}
-        few = terms - 1
-        message = f"{few} valid points cannot determine the {terms} coefficients"
+        too_few = terms - 1
+        message = f"{too_few} valid points cannot determine the {terms} coefficients"
         with pytest.raises(UserError, match=message):
-            fit(x[:few], y[:few], z[:few], **settings)
+            fit(x[:too_few], y[:too_few], z[:too_few], **settings)
         # just enough points lie on the surface
         exact = fit(x[:terms], y[:terms], z[:terms], **settings)
         assert difference_m(exact, z[:terms], x[:terms], y[:terms]) < 1e-9
@@ -375,18 +375,18 @@ def test_a_quadric_is_the_near_or_the_far_side_of_an_ellipsoid(central, sign, ra
     spoiled[:40] *= 1.02
     surface = quadric(spoiled, weights, central)
     assert surface is not None
-    others = seen(rays(2, central))
-    np.testing.assert_allclose(surface(others), others[:, 2], atol=2e-5)
+    second = seen(rays(2, central))
+    np.testing.assert_allclose(surface(second), second[:, 2], atol=2e-5)
     # a point off the surface gets the surface on its own ray
-    moved = others * 1.1 if central else others + np.array([0.0, 0.0, 0.1])
-    np.testing.assert_allclose(surface(moved), others[:, 2], atol=2e-5)
+    moved = second * 1.1 if central else second + np.array([0.0, 0.0, 0.1])
+    np.testing.assert_allclose(surface(moved), second[:, 2], atol=2e-5)
 
 
 def test_a_ray_that_misses_a_quadric_has_no_surface() -> None:
-    places = rays(1, False)
-    off = places - CENTRE_M[:2]
+    points = rays(1, False)
+    off = points - CENTRE_M[:2]
     z = CENTRE_M[2] - np.sqrt(0.16 - (off**2).sum(axis=1))
-    surface = quadric(np.column_stack([places, z]), np.ones(400), False)
+    surface = quadric(np.column_stack([points, z]), np.ones(400), False)
     assert surface is not None
     beside = np.array(
         [[CENTRE_M[0] + 0.39, CENTRE_M[1], 1.0], [CENTRE_M[0] + 0.41, CENTRE_M[1], 1.0]]

@@ -39,33 +39,33 @@ def test_rays_meet_the_triangle_that_is_first_of_all() -> None:
             assert number[i] == -1
             continue
         assert number[i] == distances.argmin()
-        place = origins[i] + distances.min() * directions[i]
-        np.testing.assert_allclose(shares[i] @ SCATTERED[number[i]], place, atol=1e-9)
+        met_point = origins[i] + distances.min() * directions[i]
+        np.testing.assert_allclose(shares[i] @ SCATTERED[number[i]], met_point, atol=1e-9)
     assert 60 < (number >= 0).sum() < 290
 
 
 def test_the_closest_place_is_on_the_closest_triangle() -> None:
     points = DRAWS.uniform(-2.0, 2.0, (60, 3))
-    number, places = closest_places(tree_of(SCATTERED), points)
+    number, feet = closest_places(tree_of(SCATTERED), points)
     for i in range(60):
         sampled = [sampled_distance(corners, points[i]) for corners in SCATTERED]
-        off = np.linalg.norm(places[i] - points[i])
+        off = np.linalg.norm(feet[i] - points[i])
         assert min(sampled) - 0.01 < off <= min(sampled) + 1e-12
         assert sampled[number[i]] < min(sampled) + 0.01
-        assert sampled_distance(SCATTERED[number[i]], places[i]) < 0.02
+        assert sampled_distance(SCATTERED[number[i]], feet[i]) < 0.02
 
 
 def test_equal_distances_and_flat_boxes() -> None:
     """A flat square of two triangles, twice: boxes without depth, and ties on all of it."""
     square = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[1, 1, 1], [0, 1, 1], [1, 0, 1]]], float)
     tree = tree_of(np.concatenate([square, square]))
-    x, y = (places.ravel() for places in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
+    x, y = (feet.ravel() for feet in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
     starts = np.column_stack([x, y, np.zeros(81)])
     number, _ = first_hits(tree, starts, np.tile([0.0, 0.0, 2.0], (81, 1)))
     np.testing.assert_array_equal(number, np.where(x + y <= 1.0, 0, 1))
-    below, places = closest_places(tree, starts)
+    below, feet = closest_places(tree, starts)
     np.testing.assert_array_equal(below, np.where(x + y <= 1.0, 0, 1))
-    np.testing.assert_allclose(places, starts + np.array([0.0, 0.0, 1.0]), atol=1e-15)
+    np.testing.assert_allclose(feet, starts + np.array([0.0, 0.0, 1.0]), atol=1e-15)
     away, _ = first_hits(tree, starts, np.tile([0.0, 0.0, -2.0], (81, 1)))
     assert (away == -1).all()
     nowhere, _ = first_hits(tree, np.full((2, 3), np.nan), starts[:2])

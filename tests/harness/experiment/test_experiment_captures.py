@@ -52,17 +52,17 @@ def test_a_capture_is_known_by_its_content(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     depth_folder(folder)
-    (here,) = loaded(folder, CAPTURE).points
+    (point,) = loaded(folder, CAPTURE).points
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     depth_folder(elsewhere)
     (moved,) = loaded(elsewhere, CAPTURE).points
-    assert (moved.digest, moved.frames_key) == (here.digest, here.frames_key)
-    other = tmp_path_factory.mktemp("other")
-    depth_folder(other, 701)
-    (changed,) = loaded(other, CAPTURE).points
-    assert changed.digest != here.digest
+    assert (moved.digest, moved.frames_key) == (point.digest, point.frames_key)
+    second_folder = tmp_path_factory.mktemp("other")
+    depth_folder(second_folder, 701)
+    (changed,) = loaded(second_folder, CAPTURE).points
+    assert changed.digest != point.digest
     (unit,) = loaded(folder, CAPTURE, "source.unit=4000/m").points
-    assert unit.frames_key != here.frames_key
+    assert unit.frames_key != point.frames_key
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,10 @@ def test_paths_count_from_the_file_and_on_the_command_line_from_the_current_fold
     current = tmp_path_factory.mktemp("current")
     monkeypatch.chdir(current)
     assert loaded(folder, CAPTURE).data["source"]["paths"] == [str(frames)]
-    other = depth_folder(current)
-    assert loaded(folder, CAPTURE, "source.paths=[frames]").data["source"]["paths"] == [str(other)]
+    second_folder = depth_folder(current)
+    assert loaded(folder, CAPTURE, "source.paths=[frames]").data["source"]["paths"] == [
+        str(second_folder)
+    ]
 
 
 def test_a_changed_file_is_another_experiment(folder: Path) -> None:

@@ -38,9 +38,9 @@ def test_rooms_of_which_nothing_is_used_are_left_out():
 
 def test_a_detector_counts_with_the_sources_that_it_reaches():
     thesis = simulation_digests(["thesis"], ["kinect_v2"])
-    both = simulation_digests(["thesis", "matched"], ["kinect_v2"])
-    assert "detectors/methods" in changed_parts(thesis, both)
-    assert "scenes/render" not in changed_parts(thesis, both)
+    both_detectors = simulation_digests(["thesis", "matched"], ["kinect_v2"])
+    assert "detectors/methods" in changed_parts(thesis, both_detectors)
+    assert "scenes/render" not in changed_parts(thesis, both_detectors)
 
 
 def test_a_cameras_number_counts_and_its_source_does_not(monkeypatch):

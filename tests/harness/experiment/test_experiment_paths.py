@@ -86,11 +86,15 @@ def test_set_then_get_and_nothing_else_changes(
     assert data == before
     assert set_path(changed, path, old) == before
     remaining = [
-        other
-        for other in paths_in(data)
-        if other[: len(path)] != path and path[: len(other)] != other
+        changed_pathning_path
+        for changed_pathning_path in paths_in(data)
+        if changed_pathning_path[: len(path)] != path
+        and path[: len(changed_pathning_path)] != changed_pathning_path
     ]
-    assert all(shape.get(changed, other) is shape.get(data, other) for other in remaining)
+    assert all(
+        shape.get(changed, changed_pathning_path) is shape.get(data, changed_pathning_path)
+        for changed_pathning_path in remaining
+    )
     assert key_path(".".join(map(str, path))) == path
 
 
@@ -150,8 +154,8 @@ def test_override_values_are_yaml_and_have_their_place() -> None:
         "target": {"distances": [0.001, 2]},
         "sweep": {"target.distances": [[1], [2]]},
     }
-    place = source.place_of(("target", "distances", 1))
-    assert (place.head, place.line_text, place.column) == (
+    position = source.place_of(("target", "distances", 1))
+    assert (position.head, position.line_text, position.column) == (
         "--set",
         "target={distances: [1e-3, 2]}",
         27,

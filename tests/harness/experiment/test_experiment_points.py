@@ -406,8 +406,8 @@ def test_mistakes_of_the_axes_have_the_place_of_the_value(
 
 
 def test_too_many_points(folder: Path) -> None:
-    many = ", ".join(map(str, range(1, 201)))
-    message = refused(folder, f"{BASE}sweep:\n  capture.frames: [{many}]\n  seed: [{many}]\n")
+    values = ", ".join(map(str, range(1, 201)))
+    message = refused(folder, f"{BASE}sweep:\n  capture.frames: [{values}]\n  seed: [{values}]\n")
     assert "x.yaml:12:1: the axes make 40000 points" in message
 
 

@@ -58,12 +58,16 @@ def test_draws_differ_by_seed_purpose_and_key_and_in_nothing_else():
     def draws(unknown, seed, purpose):
         return [unknown.drawn(seed, purpose, board) for board in range(12)]
 
-    other = BLUR.model_copy(update={"key": "source.camera.numbers.unit.jitter_mm"})
+    jitter = BLUR.model_copy(update={"key": "source.camera.numbers.unit.jitter_mm"})
     another_reason = BLUR.model_copy(update={"reason": "something else"})
     first = draws(BLUR, 1, "damaged")
     assert first == draws(another_reason, 1, "damaged")
-    different = [draws(BLUR, 2, "damaged"), draws(BLUR, 1, "hole_free"), draws(other, 1, "damaged")]
-    assert all(first != others for others in different)
+    different = [
+        draws(BLUR, 2, "damaged"),
+        draws(BLUR, 1, "hole_free"),
+        draws(jitter, 1, "damaged"),
+    ]
+    assert all(first != second for second in different)
 
 
 def test_facts_that_overlap():
@@ -222,5 +226,5 @@ def test_set_ups_with_drawn_unknowns():
 def test_a_first_look_leaves_the_unknowns_of_a_study_out():
     experiment = load_experiment("experiments/detection_limit.yaml", quick=True)
     assert experiment.config.unknowns == ()
-    whole = load_experiment("experiments/detection_limit.yaml")
-    assert len(whole.points) == 2 * len(experiment.points)
+    complete = load_experiment("experiments/detection_limit.yaml")
+    assert len(complete.points) == 2 * len(experiment.points)

@@ -60,8 +60,8 @@ def test_candidates_share_one_fit_of_the_surface(monkeypatch: pytest.MonkeyPatch
     for name in cli.CANDIDATES:
         load_detector(name, SETTINGS).analyse(fresh)
     assert len(fits) == 1
-    other = {**SETTINGS, "surface": {"shape": "polynomial", "degree": 2}}
-    load_detector("local", other).analyse(fresh)
+    polynomial = {**SETTINGS, "surface": {"shape": "polynomial", "degree": 2}}
+    load_detector("local", polynomial).analyse(fresh)
     assert len(fits) == 2
 
 
@@ -144,8 +144,8 @@ def test_one_with_more_false_calls_at_marks_is_compared_at_as_many(cloud: Cloud)
     best = chosen([few_calls, many_calls], cloud, "")
     at_its_own = chosen([blunt, sharp], cloud, "")
     # the holes found at the raised threshold are fewer than at its own
-    found = best.evidence.notes["choice"]["found"]["thesis"]
-    assert found < at_its_own.evidence.notes["choice"]["found"]["thesis"]
+    hits = best.evidence.notes["choice"]["found"]["thesis"]
+    assert hits < at_its_own.evidence.notes["choice"]["found"]["thesis"]
     assert best.threshold in (few_calls.threshold, many_calls.threshold)
     text = best.evidence.notes["choice"]["text"]
     assert f" at {few_calls.expected:.2g} expected false calls; " in text
@@ -190,16 +190,16 @@ def test_the_first_is_taken_where_nothing_can_be_implanted(cloud: Cloud) -> None
 
 
 def test_a_difference_must_exceed_chance() -> None:
-    found = np.zeros(60, bool)
-    by_other = found.copy()
-    found[:5] = True
-    assert _is_better(found, by_other)
-    found[4] = False  # 4 to 0: 4 is no more than twice the root of 4
-    assert not _is_better(found, by_other)
-    found[:9] = True
+    hits = np.zeros(60, bool)
+    by_other = hits.copy()
+    hits[:5] = True
+    assert _is_better(hits, by_other)
+    hits[4] = False  # 4 to 0: 4 is no more than twice the root of 4
+    assert not _is_better(hits, by_other)
+    hits[:9] = True
     by_other[9:12] = True  # 9 to 3: 6 is less than twice the root of 12
-    assert not _is_better(found, by_other)
-    assert not _is_better(found, found)
+    assert not _is_better(hits, by_other)
+    assert not _is_better(hits, hits)
 
 
 def options(*words: str) -> argparse.Namespace:

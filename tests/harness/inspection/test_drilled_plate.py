@@ -72,13 +72,13 @@ def is_cut(centre: np.ndarray) -> bool:
 
 def result_of(contender: Contender, cloud: Cloud) -> Result:
     evidence = contender.evidence
-    found = contender.detector.find(cloud, evidence, contender.threshold)
+    detections = contender.detector.find(cloud, evidence, contender.threshold)
     is_behind = behind(evidence).ravel()
     scores = evidence.score.ravel()
     holes = places(HOLES)
     hit = np.zeros(len(holes), bool)
     false = 0
-    for finding in each_object_once(cloud, evidence, found):
+    for finding in each_object_once(cloud, evidence, detections):
         strongest = finding.pixels[np.argmax(scores[finding.pixels])]
         if finding.kind != "depth" or not is_behind[strongest]:
             continue
@@ -131,10 +131,10 @@ def one_frame(folder: Path, number: int, picture: np.ndarray) -> Cloud:
 
 @pytest.fixture(scope="module")
 def folder(shared_data: Path) -> Path:
-    found = shared_data / "azure_drilled_board"
-    if not found.is_dir():
+    folder = shared_data / "azure_drilled_board"
+    if not folder.is_dir():
         pytest.skip("the capture of the drilled plate is not here")
-    return found
+    return folder
 
 
 @pytest.mark.slow

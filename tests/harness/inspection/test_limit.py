@@ -68,12 +68,14 @@ class WidthDetector:
 
         scores = np.nan_to_num(evidence.score)
         labels, count = ndimage.label(scores >= threshold)
-        found = []
+        detections = []
         for number in range(1, count + 1):
             pixels = np.flatnonzero(labels.ravel() == number)
             if len(pixels) >= self.least_px:
-                found.append(Detection(float(scores.ravel()[pixels].max()), pixels, np.zeros(3)))
-        return tuple(found)
+                detections.append(
+                    Detection(float(scores.ravel()[pixels].max()), pixels, np.zeros(3))
+                )
+        return tuple(detections)
 
     def quiet_threshold(self, cloud: Cloud, evidence: Evidence) -> float:
         return 0.0
@@ -132,8 +134,8 @@ def test_centres_lie_apart_from_one_another_from_the_rim_and_from_findings() -> 
     centres = places_for(judged, free_area(judged), disc)
     rows, columns = np.divmod(centres, SHAPE[1])
     assert len(centres) >= 4
-    apart = np.hypot(rows[:, None] - rows, columns[:, None] - columns)
-    assert apart[np.triu_indices(len(centres), 1)].min() >= 10 + APART_PX
+    distances_px = np.hypot(rows[:, None] - rows, columns[:, None] - columns)
+    assert distances_px[np.triu_indices(len(centres), 1)].min() >= 10 + APART_PX
     assert rows.min() >= 5 and columns.min() >= 5
     assert rows.max() <= SHAPE[0] - 6 and columns.max() <= SHAPE[1] - 6
     from_finding = np.hypot(rows[:, None] - 54.5, columns[:, None] - 74.5)

@@ -165,9 +165,9 @@ def test_states(
     def size(depth_mm: float | None) -> DamageSize | None:
         return None if depth_mm is None else DamageSize(10.0, depth_mm, 0.1)
 
-    found = finding(depth_mm=change_mm, depth_se_mm=0.1, diameter_mm=10.0)
+    changed = finding(depth_mm=change_mm, depth_se_mm=0.1, diameter_mm=10.0)
     change = _change(
-        found, size(then_mm), size(now_mm), was_there=was_there, distance_m=1e-3, lod_m=1e-4
+        changed, size(then_mm), size(now_mm), was_there=was_there, distance_m=1e-3, lod_m=1e-4
     )
     assert change.state == state
     if change_mm == 1.5 and now_mm == 2.5:

@@ -101,16 +101,16 @@ def test_contributions_add_as_squares() -> None:
 def test_the_part_is_as_its_worst_finding_and_what_was_missed(
     decisions: tuple[str, ...], missed: Missed, decision: str
 ) -> None:
-    found = tuple(on(number, each) for number, each in enumerate(decisions, start=1))
-    part = PartDecision((DEPTH,), found, missed, "")
+    findings = tuple(on(number, text) for number, text in enumerate(decisions, start=1))
+    part = PartDecision((DEPTH,), findings, missed, "")
     assert part.decision == decision
     assert part.facts["decision"] == decision
     assert part.sentence.endswith("so much is missed.")
 
 
 def test_the_sentence_names_the_findings() -> None:
-    found = (on(1, FAILS), on(2, UNDECIDED), on(3, FAILS), on(4, CONFORMS))
-    part = PartDecision((DEPTH, Tolerance("width", 4.0)), found, FOUND, "")
+    findings = (on(1, FAILS), on(2, UNDECIDED), on(3, FAILS), on(4, CONFORMS))
+    part = PartDecision((DEPTH, Tolerance("width", 4.0)), findings, FOUND, "")
     start = "The part does not conform to a depth of at most 0.5 mm and width of at most 4 mm"
     assert part.short == f"{start} (findings 1 and 3; undecided: finding 2)"
     assert "a growth in depth" in replace(part, since="the earlier capture").short
@@ -145,11 +145,11 @@ def test_tolerances_are_stated_with_units() -> None:
 def test_few_simulated_parts_are_decided_wrongly() -> None:
     """The full number of parts is in tests/validation/tolerance_risks.py."""
     decisions = [decided_on(number, None) for number in range(12)]
-    assert sum(each.is_wrong for each in decisions) <= 2
+    assert sum(decision.is_wrong for decision in decisions) <= 2
     # two guard bands of 0.2 mm from the limit, nearly all are decided
-    clear = [each for each in decisions if not 0.55 < each.true_mm < 1.25]
+    clear = [decision for decision in decisions if not 0.55 < decision.true_mm < 1.25]
     assert clear
-    assert all(each.decision != UNDECIDED for each in clear)
+    assert all(decision.decision != UNDECIDED for decision in clear)
 
 
 def test_volume_and_deviation_are_those_of_a_dent(tmp_path: Path) -> None:
@@ -193,8 +193,8 @@ def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> No
     assert tolerance["decision"] == FAILS
     assert tolerance["since"] == "the earlier capture"
     states = {change["id"]: change["state"] for change in data["change"]["damage"]}
-    of_depth = [each for each in tolerance["findings"] if each["kind"] == "depth"]
-    failing = [each["id"] for each in of_depth if each["decision"] == FAILS]
+    of_depth = [finding for finding in tolerance["findings"] if finding["kind"] == "depth"]
+    failing = [finding["id"] for finding in of_depth if finding["decision"] == FAILS]
     # the old dent is the same in both captures, and the one that was filled is no damage now
     assert [states[number] for number in failing] == ["new"]
     names = [entry["name"] for entry in tolerance["findings"][0]["contributions"]]

@@ -110,16 +110,16 @@ def judged_of(*scores: float, rows: tuple[int, ...] = ()) -> Judged:
 
 def test_findings_with_unknown_odds_are_faint_up_to_one_and_a_half_times_the_threshold() -> None:
     result = with_remarks(judged_of(8.9, 9.1), 6.0)
-    assert [each.certainty for each in result.findings] == ["doubtful", "sure"]
-    assert [each.flags for each in result.findings] == ["faint", ""]
+    assert [remarked.certainty for remarked in result.findings] == ["doubtful", "sure"]
+    assert [remarked.flags for remarked in result.findings] == ["faint", ""]
 
 
 @pytest.mark.parametrize(("odds", "certainty"), [(0.049, "sure"), (0.051, "doubtful")])
 def test_known_odds_decide_whatever_the_score(odds: float, certainty: str) -> None:
     for score in (1.0, 99.0):
-        known = finding(noise_probability=odds, score=score)
-        flags = flags_of(known, is_cut=False, least_score=50.0)
-        assert verdict.class_of(known, flags) == certainty
+        judged_finding = finding(noise_probability=odds, score=score)
+        flags = flags_of(judged_finding, is_cut=False, least_score=50.0)
+        assert verdict.class_of(judged_finding, flags) == certainty
 
 
 def test_what_noise_may_explain_at_the_rim_is_doubtful() -> None:
@@ -132,21 +132,26 @@ def test_what_noise_may_explain_at_the_rim_is_doubtful() -> None:
 def test_a_finding_at_the_rim_is_of_its_own_class() -> None:
     """The first row of the picture is the rim, the second is not."""
     result = with_remarks(judged_of(20.0, 20.0, rows=(0, 1)), 5.0)
-    assert [each.flags for each in result.findings] == ["at_rim", ""]
-    assert [each.certainty for each in result.findings] == ["rim or blind", "sure"]
+    assert [remarked.flags for remarked in result.findings] == ["at_rim", ""]
+    assert [remarked.certainty for remarked in result.findings] == ["rim or blind", "sure"]
 
 
 def test_blur_carries_a_finding_to_the_rim_by_half_of_its_width() -> None:
     """The fourth row is 4 pixels deep, the fifth 5."""
     plain = judged_of(20.0, 20.0, rows=(3, 4))
     native = with_remarks(plain, 5.0)
-    assert [each.flags for each in native.findings] == ["", ""]
+    assert [judged_findingrked.flags for judged_findingrked in native.findings] == ["", ""]
     blurred = replace(plain, cloud=replace(plain.cloud, noise_reach_px=8.0))
-    assert [each.flags for each in with_remarks(blurred, 5.0).findings] == ["at_rim", ""]
+    assert [
+        judged_findingrked.flags for judged_findingrked in with_remarks(blurred, 5.0).findings
+    ] == ["at_rim", ""]
     sides_px = np.full((2, 1, 1), 8.0, np.float32)
     sides_px[1] = 10.0
     wider = replace(plain.cloud, noise_reach_px=8.0, noise_sides_px=sides_px)
-    flags = [each.flags for each in with_remarks(replace(plain, cloud=wider), 5.0).findings]
+    flags = [
+        judged_findingrked.flags
+        for judged_findingrked in with_remarks(replace(plain, cloud=wider), 5.0).findings
+    ]
     assert flags == ["at_rim", "at_rim"]
 
 
@@ -250,8 +255,8 @@ def test_the_share_is_that_of_the_outline_and_the_blind_area_that_of_its_pixels(
     outline[:, :45] = True
     missing = MissingReturns(outline, np.zeros((40, 60)), 0.1, 0.0, 9, 0.0, ())
     judged = Judged(cloud, evidence_of(cloud, residual_m=residual), (), (), missing)
-    for given in (outline, None):
-        extent = extent_of(judged, given)
+    for target in (outline, None):
+        extent = extent_of(judged, target)
         assert extent.judged_share == pytest.approx(30 / 45)
         assert extent.judged_m2 == pytest.approx(40 * 45 * PITCH_M**2)
         assert extent.blind_m2 == pytest.approx(0.1 * 40 * 45 * PITCH_M**2)
@@ -277,28 +282,28 @@ def test_the_area_of_a_cloud_without_a_grid_is_that_of_its_plan_view() -> None:
 
 def test_the_sentence_counts_what_is_sure_and_names_the_rest() -> None:
     result = with_remarks(judged_of(20.0, 20.0, 5.1, 20.0, rows=(15, 15, 15, 0)), 5.0)
-    said = verdict_of(result, 5.0)
-    assert said.sentence == (
+    verdict = verdict_of(result, 5.0)
+    assert verdict.sentence == (
         "Two holes found on 96 cm2 of the part; one further place is doubtful;"
         " one place is cut by the rim; 1.0 false calls expected (0 to 4)."
     )
-    assert said.counts == {"sure": 2, "doubtful": 1, "rim or blind": 1}
-    assert said.facts["sure"] == {"hole": 2}
-    assert said.facts["judged_area_m2"] == pytest.approx(0.0096)
+    assert verdict.counts == {"sure": 2, "doubtful": 1, "rim or blind": 1}
+    assert verdict.facts["sure"] == {"hole": 2}
+    assert verdict.facts["judged_area_m2"] == pytest.approx(0.0096)
 
 
 def test_with_odds_the_sentence_says_how_many_of_the_sure_are_false() -> None:
     """0.01 + 0.02 of the sure ones; the doubtful one does not count."""
     judged = replace(judged_of(20.0, 9.0, 8.0), noise_probabilities=(0.01, 0.02, 0.3))
-    said = verdict_of(with_remarks(judged, 5.0), 5.0)
-    assert said.sentence == (
+    verdict = verdict_of(with_remarks(judged, 5.0), 5.0)
+    assert verdict.sentence == (
         "Two holes found on 96 cm2 of the part; one further place is doubtful;"
         " 1.0 false calls expected (0 to 4), 0.03 of them among the sure ones."
     )
-    assert said.expected_false_sure == pytest.approx(0.03)
-    assert said.facts["expected_false_calls"] == 1.0
-    assert said.facts["fewest_false_calls"] == 0.0
-    assert said.facts["most_false_calls"] == 4.0
+    assert verdict.expected_false_sure == pytest.approx(0.03)
+    assert verdict.facts["expected_false_calls"] == 1.0
+    assert verdict.facts["fewest_false_calls"] == 0.0
+    assert verdict.facts["most_false_calls"] == 4.0
 
 
 def test_the_sentence_of_nothing_and_of_nothing_sure() -> None:
@@ -316,8 +321,8 @@ def test_the_sentence_says_which_share_of_the_part_was_judged() -> None:
     residual_m = np.zeros((40, 60))
     residual_m[:, 45:] = np.nan
     judged = replace(judged, evidence=replace(judged.evidence, residual_m=residual_m))
-    said = verdict_of(with_remarks(judged, 5.0), 5.0, outline).sentence
-    assert said.startswith("One hole found on 72 cm2, 75 % of the part; ")
+    sentence = verdict_of(with_remarks(judged, 5.0), 5.0, outline).sentence
+    assert sentence.startswith("One hole found on 72 cm2, 75 % of the part; ")
 
 
 @pytest.mark.parametrize(
@@ -339,18 +344,18 @@ def test_joints_are_a_feature_and_no_damage(differing: int, clause: str) -> None
         detections=(features,),
         measurements=judged.measurements[:1],
     )
-    said = verdict_of(with_remarks(only, 5.0), 5.0)
-    assert said.sentence.startswith(f"No damage found on 96 cm2 of the part; {clause}")
-    assert said.counts == {"sure": 0, "doubtful": 0, "rim or blind": 0, "feature": 1}
-    assert said.sure_terms == {}
+    verdict = verdict_of(with_remarks(only, 5.0), 5.0)
+    assert verdict.sentence.startswith(f"No damage found on 96 cm2 of the part; {clause}")
+    assert verdict.counts == {"sure": 0, "doubtful": 0, "rim or blind": 0, "feature": 1}
+    assert verdict.sure_terms == {}
     beside = replace(
         only,
         detections=(features, *judged.detections[1:]),
         measurements=judged.measurements,
     )
-    said = verdict_of(with_remarks(beside, 5.0), 5.0)
-    assert said.sentence.startswith("One hole found on 96 cm2 of the part; one further place")
-    assert said.counts == {"sure": 1, "doubtful": 1, "rim or blind": 0, "feature": 1}
+    verdict = verdict_of(with_remarks(beside, 5.0), 5.0)
+    assert verdict.sentence.startswith("One hole found on 96 cm2 of the part; one further place")
+    assert verdict.counts == {"sure": 1, "doubtful": 1, "rim or blind": 0, "feature": 1}
 
 
 def test_numbers_are_words_up_to_twelve_and_terms_have_plurals() -> None:

@@ -88,9 +88,9 @@ def test_records_do_not_share_their_lists() -> None:
 def test_tables_have_the_columns_of_their_rows(table: Table, row_type: type) -> None:
     names = [column.name for column in table.columns]
     origin = [field.name for field in fields(Origin)]
-    own = [field.name for field in fields(row_type)]
-    place = own.index("origin")
-    assert names == [*own[:place], *origin, *own[place + 1 :]]
+    field_names = [field.name for field in fields(row_type)]
+    index = field_names.index("origin")
+    assert names == [*field_names[:index], *origin, *field_names[index + 1 :]]
 
 
 def test_a_column_of_noise_has_a_note_for_each_lag() -> None:

@@ -157,9 +157,9 @@ def test_a_trial_costs_a_few_kilobytes_of_memory():
         tracemalloc.stop()
         return peak + pa.total_allocated_bytes() - before, tables
 
-    few, _ = needed(200)
-    many, tables = needed(600)
-    assert (many - few) / 400 < 5000
+    of_200, _ = needed(200)
+    of_600, tables = needed(600)
+    assert (of_600 - of_200) / 400 < 5000
     assert len(tables.pixels) == 150 * 2 * 9 and len(tables.holes) == 150 * 2 * 8
 
 
@@ -171,6 +171,8 @@ def test_lists_are_rows_of_the_files(tmp_path):
     rows = [row for record in records for row in record.get("pixels", ())]
     rows.sort(key=lambda row: (row["frames"], row["board"]))
     assert stored["above"].tolist() == [count for row in rows for count in row["above"]]
-    assert stored["threshold"].tolist() == [at for row in rows for at in row["threshold"]]
+    assert stored["threshold"].tolist() == [
+        threshold for row in rows for threshold in row["threshold"]
+    ]
     assert stored["hole"].tolist() == [row["hole"] for row in rows for _ in row["above"]]
     assert stored["above"].dtype == np.int64

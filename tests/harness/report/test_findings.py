@@ -56,10 +56,10 @@ def test_without_a_model_the_extreme_residual_is_turned_alike() -> None:
 def test_joints_have_a_mark_at_each_place_and_other_findings_one() -> None:
     cloud = plane(seed=1)
     width = cloud.valid.shape[1]
-    places = np.array([2 * width + 3, 2 * width + 4, 3 * width + 5, 20 * width + 30])
-    joints = Detection(9.0, places, np.zeros(3), count=2)
+    pixels = np.array([2 * width + 3, 2 * width + 4, 3 * width + 5, 20 * width + 30])
+    joints = Detection(9.0, pixels, np.zeros(3), count=2)
     large, small = parts_of(cloud, joints)
-    assert large.pixels.tolist() == places[:3].tolist()
-    assert small.pixels.tolist() == places[3:].tolist()
-    (whole,) = parts_of(cloud, Detection(9.0, places, np.zeros(3)))
-    assert whole.pixels.tolist() == places.tolist()
+    assert large.pixels.tolist() == pixels[:3].tolist()
+    assert small.pixels.tolist() == pixels[3:].tolist()
+    (part,) = parts_of(cloud, Detection(9.0, pixels, np.zeros(3)))
+    assert part.pixels.tolist() == pixels.tolist()

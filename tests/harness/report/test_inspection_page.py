@@ -128,8 +128,10 @@ def test_each_class_has_its_own_table() -> None:
     text = "".join(map(str, class_sections([uncertain], {"sure": "real"})))
     assert "8.0\u00a0±\u00a00.2" in text and "5.00\u00a0±\u00a00.05" in text
     assert "Rim: none" in str(class_sections([finding], {"rim": "cut"})[0])
-    many = [replace(finding, id=n, certainty="sure") for n in range(1, 24)]
-    assert "<summary>3 more</summary>" in "".join(map(str, class_sections(many, {"sure": "real"})))
+    findings = [replace(finding, id=n, certainty="sure") for n in range(1, 24)]
+    assert "<summary>3 more</summary>" in "".join(
+        map(str, class_sections(findings, {"sure": "real"}))
+    )
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -143,15 +145,15 @@ def test_every_number_of_the_page_stands_in_a_data_file(tmp_path: Path) -> None:
     with (out / "findings.csv").open(newline="") as stream:
         (row,) = csv.DictReader(stream)
     verdict = facts["verdict"]
-    headline, further = split_answer(verdict["sentence"])
-    assert f'<p class="answer">{headline}</p>\n<p>{further}</p>' in page
+    headline, continuation = split_answer(verdict["sentence"])
+    assert f'<p class="answer">{headline}</p>\n<p>{continuation}</p>' in page
     assert "<b>plate" not in page and "&lt;b&gt;plate" in page
-    head, _, rest = page.partition("<main>")
+    head, _, body = page.partition("<main>")
     assert verdict["sentence"].startswith("One hole found on ")
     assert f"{1e4 * verdict['judged_area_m2']:.4g} cm2" in head
     assert f"{100 * verdict['judged_share_of_outline']:.0f} %" in head
     assert verdict["counts"] == {"sure": 1, "doubtful": 0, "rim or blind": 0}
-    cells = re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", rest[: rest.index("The cloud")])
+    cells = re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", body[: body.index("The cloud")])
     for column, digits in (("diameter_mm", 1), ("depth_mm", 2), ("x_mm", 1), ("score", 2)):
         text = f"{float(row[column]):.{digits}f}"
         assert any(cell.split("\u00a0")[0] == text for cell in cells)

@@ -50,9 +50,9 @@ def test_each_size_has_a_panel_and_one_counts_the_holes(summary: pd.DataFrame) -
     assert of_hole_1[:, 2].tolist() == list(FRAMES)
     assert of_hole_1[:, 3] == pytest.approx(3 / 4)
     (counts,) = (line for line in lines if line[0] == "holes found")
-    found = [(summary["status"] == "found")[summary["frames"] == n].sum() for n in FRAMES]
-    assert np.reshape(counts[1:], (-1, 4))[:, 3].tolist() == found
-    assert found == [7, 8, 8]
+    counts_found = [(summary["status"] == "found")[summary["frames"] == n].sum() for n in FRAMES]
+    assert np.reshape(counts[1:], (-1, 4))[:, 3].tolist() == counts_found
+    assert counts_found == [7, 8, 8]
 
 
 def test_with_one_number_of_frames_margins_stand_over_the_size(summary: pd.DataFrame) -> None:

@@ -33,22 +33,22 @@ STYLE = Path(__file__).parents[3] / "harness" / "report" / "style.css"
 
 def page_texts() -> dict[str, str]:
     """Return the pages of experiments by name."""
-    about = About(provenance(), "name: x\n", "A title")
+    origin = About(provenance(), "name: x\n", "A title")
     maps = perspectives(MapWorld(), (1, 50), (1, 2, 9), METHODS, ("grid", "fusion"))
     set_ups = [
         SetUp(variant=f"camera {name}", frames=frames, a50_mm=a50_mm)
         for name, a50_mm in (("one", 4.0), ("two", 5.0), ("three", 6.0))
         for frames in (1, 10, 50)
     ]
-    seen = tuple(
+    boards = tuple(
         study_example(variant="camera one", frames=50, where=where)
         for where in ("below", "at", "above")
     )
     return {
-        "sweep": report_html(tables(frames=(1, 10, 50)), [example(50)], about),
-        "set_ups": set_ups_html(cameras(SMALLEST), clouds(), about),
-        "perspectives": perspectives_html(maps, examples(), about),
-        "study": html(judged(small(*set_ups)), seen),
+        "sweep": report_html(tables(frames=(1, 10, 50)), [example(50)], origin),
+        "set_ups": set_ups_html(cameras(SMALLEST), clouds(), origin),
+        "perspectives": perspectives_html(maps, examples(), origin),
+        "study": html(judged(small(*set_ups)), boards),
     }
 
 

@@ -105,9 +105,9 @@ def test_the_answer_counts_holes_and_says_every_verdict(page):
 
 
 def test_the_same_input_gives_the_same_bytes(small):
-    about = About(provenance(), YAML, "T")
-    first = perspectives_html(small, [map_example(2)], about)
-    second = perspectives_html(small, [map_example(2)], about)
+    origin = About(provenance(), YAML, "T")
+    first = perspectives_html(small, [map_example(2)], origin)
+    second = perspectives_html(small, [map_example(2)], origin)
     assert first == second
 
 

@@ -136,9 +136,9 @@ def test_a_page_of_another_target_does_not_mention_the_thesis():
 
 def test_the_answer_says_what_each_camera_finds_and_the_verdict(page):
     expected = "with 50 averaged frames: Azure Kinect DK NFOV unbinned: 9, 8."
-    headline, further = first_words(page)
+    headline, continuation = first_words(page)
     assert headline == f"Found of 11 holes at 0.5 m, 1 m {expected}"
-    assert further == "Kinect v2: 8, 7; RealSense L515 XGA: 8, 8."
+    assert continuation == "Kinect v2: 8, 7; RealSense L515 XGA: 8, 8."
     # one unit of each camera
     assert "Of 1 claim, 1 is undecided (C11)." in page
 

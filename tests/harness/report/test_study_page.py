@@ -193,7 +193,7 @@ def test_the_first_figure_shows_each_interval_of_a90_in_a_row_of_its_own(
     (figure,) = re.findall(r'<figure id="limits">.*?</figure>', page, re.DOTALL)
     (values,) = re.findall(r'data-values="([^"]+)"', figure)
     (panel,) = json.loads(unescape(values))
-    rows = {name: (at[2], at[6], at[3]) for name, *at in panel["lines"]}
+    rows = {name: (cells[2], cells[6], cells[3]) for name, *cells in panel["lines"]}
     expected = {
         limit.record.label: (limit.a90_interval_mm.low, limit.a90_interval_mm.high, row)
         for row, limit in enumerate(whole.limits)

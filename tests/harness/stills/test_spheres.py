@@ -72,14 +72,14 @@ def test_nothing_is_a_sphere_that_is_none(sigma_m: float):
 def test_too_few_pixels_give_no_number():
     image = sphere_scene(CENTRES_M, RADIUS_M, 1e-3)
     on_sphere = disc(image, CENTRES_M[0], RADIUS_M)
-    few = image.range_m.copy()
-    few.ravel()[on_sphere[FEWEST_PX - 1 :]] = np.nan
-    fit = fit_sphere(RangeImage(few, image.rays), CENTRES_M[0], RADIUS_M)
+    sparse = image.range_m.copy()
+    sparse.ravel()[on_sphere[FEWEST_PX - 1 :]] = np.nan
+    fit = fit_sphere(RangeImage(sparse, image.rays), CENTRES_M[0], RADIUS_M)
     assert isinstance(fit, NoFit)
     assert fit.why == "39 pixels with a range, 40 needed"
-    left = image.range_m.copy()
-    left.ravel()[on_sphere[on_sphere % LENS.width > 57]] = np.nan
-    fit = fit_sphere(RangeImage(left, image.rays), CENTRES_M[0], RADIUS_M)
+    half = image.range_m.copy()
+    half.ravel()[on_sphere[on_sphere % LENS.width > 57]] = np.nan
+    fit = fit_sphere(RangeImage(half, image.rays), CENTRES_M[0], RADIUS_M)
     assert isinstance(fit, NoFit)
     assert fit.why == "its pixels lie on one side of it"
 

@@ -126,8 +126,8 @@ def test_widths_by_hand():
     turned = [np.swapaxes(z, 1, 2), front.T, back.T, from_edge.T]
     across_rows = edge_widths(*turned, 0.01, 15, across=1)  # type: ignore[misc]
     assert {name: width[0] for name, width in across_rows.items()} == wanted
-    near = edge_widths(z, front, back, from_edge, 0.01, 1.0, across=2)
-    assert {name: width[0] for name, width in near.items()} == {**wanted, "gap": 1.0}
+    edge_m = edge_widths(z, front, back, from_edge, 0.01, 1.0, across=2)
+    assert {name: width[0] for name, width in edge_m.items()} == {**wanted, "gap": 1.0}
     assert edge_widths(z, front, back, from_edge, np.nan, 15, across=2)["gap"][0] == 2.5
 
 
@@ -383,8 +383,8 @@ def test_the_best_tried_plane_is_that_of_most_points() -> None:
         free = np.isfinite(z)
         best = _best_candidate(z, _with_ones(slopes), free, 1e-3, number)
         assert best == pytest.approx(inverse_of(walls[0]), abs=1e-9)
-        other = _best_candidate(z, _with_ones(slopes), free & ~on_first, 1e-3, number)
-        assert other == pytest.approx(inverse_of(walls[1]), abs=1e-9)
+        second = _best_candidate(z, _with_ones(slopes), free & ~on_first, 1e-3, number)
+        assert second == pytest.approx(inverse_of(walls[1]), abs=1e-9)
 
 
 def test_points_in_a_line_give_a_plane_that_faces_the_camera() -> None:

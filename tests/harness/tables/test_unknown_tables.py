@@ -69,8 +69,8 @@ def test_a_sentence_without_effects():
     idle = result_with(drawn_set_up(idle_only=True))
     (sentence,) = unknown_sentences(idle)
     assert "no unknown moves it beyond chance (at most " in sentence
-    few = result_with(drawn_set_up(boards=12))
-    (sentence,) = unknown_sentences(few)
+    of_few_boards = result_with(drawn_set_up(boards=12))
+    (sentence,) = unknown_sentences(of_few_boards)
     assert "; 12 boards are too few to tell the unknowns apart; 15 are needed; " in sentence
 
 

@@ -184,10 +184,10 @@ class MeanScores(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         score = evidence.score.reshape(-1)
         result = [
-            replace(one, score=float(score[one.pixels].mean()))
-            for one in super().find(cloud, evidence, threshold)
+            replace(detection, score=float(score[detection.pixels].mean()))
+            for detection in super().find(cloud, evidence, threshold)
         ]
-        return tuple(sorted(result, key=lambda one: -one.score))
+        return tuple(sorted(result, key=lambda detection: -detection.score))
 
 
 class NeverQuiet(Sound):
@@ -213,8 +213,8 @@ class Rings(Sound):
 class Unsorted(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         return tuple(
-            replace(one, pixels=one.pixels[::-1])
-            for one in super().find(cloud, evidence, threshold)
+            replace(detection, pixels=detection.pixels[::-1])
+            for detection in super().find(cloud, evidence, threshold)
         )
 
 
@@ -222,22 +222,25 @@ class TakesInvalid(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         gone = np.flatnonzero(~cloud.valid)[:1]
         return tuple(
-            replace(one, pixels=np.union1d(one.pixels, gone))
-            for one in super().find(cloud, evidence, threshold)
+            replace(detection, pixels=np.union1d(detection.pixels, gone))
+            for detection in super().find(cloud, evidence, threshold)
         )
 
 
 class Beyond(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         result = super().find(cloud, evidence, threshold)
-        return tuple(replace(one, pixels=np.append(one.pixels, cloud.valid.size)) for one in result)
+        return tuple(
+            replace(detection, pixels=np.append(detection.pixels, cloud.valid.size))
+            for detection in result
+        )
 
 
 class InMillimetres(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         return tuple(
-            replace(one, centre_m=1e3 * one.centre_m)
-            for one in super().find(cloud, evidence, threshold)
+            replace(detection, centre_m=1e3 * detection.centre_m)
+            for detection in super().find(cloud, evidence, threshold)
         )
 
 
@@ -313,7 +316,9 @@ class AlongRows(Sound):
 class LooksAtX(Sound):
     def find(self, cloud: Cloud, evidence: Evidence, threshold: float) -> tuple[Detection, ...]:
         result = super().find(cloud, evidence, threshold)
-        return tuple(replace(one, centre_m=np.abs(one.centre_m)) for one in result)
+        return tuple(
+            replace(detection, centre_m=np.abs(detection.centre_m)) for detection in result
+        )
 
 
 class LooksAtDistance(Sound):

@@ -61,11 +61,11 @@ def test_the_oracle_finds_each_damage_once_where_it_is(threshold: float) -> None
     detector = oracle(*TRUTH)
     evidence = detector.analyse(cloud)
     result = detector.find(cloud, evidence, threshold)
-    assert [one.score for one in result] == [1.0, 1.0, 1.0]
-    for one, true in zip(result, TRUTH, strict=True):
-        np.testing.assert_array_equal(one.centre_m, true.centre_m)
-        np.testing.assert_array_equal(one.pixels, true.pixels)
-        measured = detector.measure(cloud, evidence, one)
+    assert [detection.score for detection in result] == [1.0, 1.0, 1.0]
+    for detection, true in zip(result, TRUTH, strict=True):
+        np.testing.assert_array_equal(detection.centre_m, true.centre_m)
+        np.testing.assert_array_equal(detection.pixels, true.pixels)
+        measured = detector.measure(cloud, evidence, detection)
         assert (measured.extent_diameter_m, measured.points) == (true.diameter_m, len(true.pixels))
     assert (
         detector.find(cloud, evidence, 1.0) == ()
@@ -157,8 +157,8 @@ def test_guesses_are_as_many_as_stated_everywhere_alike_and_exponential() -> Non
     for seed in range(400):
         evidence = blind(seed=seed).analyse(cloud)
         result = detector.find(cloud, evidence, 0.0)
-        rows += [one.pixels[0] // SHAPE[1] for one in result]
-        scores += [one.score for one in result]
+        rows += [detection.pixels[0] // SHAPE[1] for detection in result]
+        scores += [detection.score for detection in result]
         area_m2 += evidence.notes["area_m2"]
         assert len(result) == evidence.notes["guesses"]
     low, high = stats.poisson.interval(1 - ALPHA, 400 * area_m2)

@@ -144,9 +144,9 @@ def test_points_that_distortion_folds_back_have_no_image() -> None:
 
 
 def test_a_lens_of_another_camera_without_its_remarks() -> None:
-    other = OtherLens(640, 576, 505.0, 504.0, 322.0, 331.0, DISTORTION, note="n", warning="w")
-    assert other.plain == LENS
-    assert type(other.plain) is Lens
+    second_lens = OtherLens(640, 576, 505.0, 504.0, 322.0, 331.0, DISTORTION, note="n", warning="w")
+    assert second_lens.plain == LENS
+    assert type(second_lens.plain) is Lens
 
 
 def test_pixels_with_a_point_are_valid() -> None:

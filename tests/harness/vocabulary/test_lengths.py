@@ -85,8 +85,10 @@ def test_lengths_in_yaml() -> None:
 
 def test_a_set_length_is_the_same_experiment() -> None:
     bare = load_experiment("smoke", ["source.target.distance_m=0.9", "matching.radius_mm=12.7"])
-    said = load_experiment("smoke", ["source.target.distance_m=90cm", "matching.radius_mm=0.5in"])
-    assert bare.digest == said.digest != load_experiment("smoke").digest
+    experiment = load_experiment(
+        "smoke", ["source.target.distance_m=90cm", "matching.radius_mm=0.5in"]
+    )
+    assert bare.digest == experiment.digest != load_experiment("smoke").digest
 
 
 def test_a_wrong_unit_has_a_message_that_says_what_is_legal() -> None:

@@ -57,10 +57,10 @@ def test_a_number_is_held_by_a_single_process_and_others_are_free(tmp_path: Path
             text=True,
         )
 
-    with process(HOLDS, 7) as holder, process(ASKS, 8) as other:
-        assert holder.stdout is not None and other.stdout is not None and holder.stdin is not None
+    with process(HOLDS, 7) as holder, process(ASKS, 8) as asking:
+        assert holder.stdout is not None and asking.stdout is not None and holder.stdin is not None
         assert holder.stdout.readline() == "held\n"
-        assert other.stdout.readline() == "held\n"
+        assert asking.stdout.readline() == "held\n"
         with process(ASKS, 7) as waiting:
             with pytest.raises(subprocess.TimeoutExpired):
                 waiting.wait(timeout=1.0)

@@ -16,10 +16,10 @@ THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def seen_by_a_program(monkeypatch: pytest.MonkeyPatch, stated: str | None) -> list[str | None]:
     """Return the threads' variables during a call from the command line, where the user states
     this number of threads."""
-    seen: list[str | None] = []
+    paths: list[str | None] = []
 
     def run(arguments: argparse.Namespace, command: str) -> int:
-        seen.extend(os.environ.get(name) for name in THREADS)
+        paths.extend(os.environ.get(name) for name in THREADS)
         return 0
 
     for name in THREADS:
@@ -30,7 +30,7 @@ def seen_by_a_program(monkeypatch: pytest.MonkeyPatch, stated: str | None) -> li
     monkeypatch.setattr("signal.signal", lambda number, handler: None)
     program = Program("looks", lambda parser: None, run, "Looks at its environment.", ())
     assert program() == 0
-    return seen
+    return paths
 
 
 def test_linear_algebra_takes_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,9 +59,9 @@ def test_a_mistake_is_one_message(words: list[str], message: str, capsys) -> Non
         parser.add_argument("--number", type=int, required=True)
 
     program = Program("paints", options, lambda parsed, command: 0, "Paints.", ())
-    given = words if words[:1] in ([], ["--number"]) else ["--number", "1", *words]
+    arguments = words if words[:1] in ([], ["--number"]) else ["--number", "1", *words]
     with pytest.raises(SystemExit, match="2"):
-        program(given)
+        program(arguments)
     printed = capsys.readouterr().err
     assert message in printed
     assert printed.startswith("error: ")
@@ -70,14 +70,14 @@ def test_a_mistake_is_one_message(words: list[str], message: str, capsys) -> Non
 
 
 def test_a_mistyped_further_program_is_not_taken_for_arguments(capsys) -> None:
-    further = Program("gauge read", lambda parser: None, lambda parsed, command: 0, "Reads.", ())
+    nested = Program("gauge read", lambda parser: None, lambda parsed, command: 0, "Reads.", ())
     gauge = Program(
         "gauge",
         lambda parser: None,
         lambda parsed, command: 1,
         "Designs.",
         (),
-        further={"read": further},
+        further={"read": nested},
     )
     assert gauge(["read"]) == 0
     assert gauge([]) == 1
@@ -87,14 +87,14 @@ def test_a_mistyped_further_program_is_not_taken_for_arguments(capsys) -> None:
 
 
 def test_an_argument_may_resemble_a_further_program() -> None:
-    further = Program("score rank", lambda parser: None, lambda parsed, command: 1, "Ranks.", ())
+    nested = Program("score rank", lambda parser: None, lambda parsed, command: 1, "Ranks.", ())
     score = Program(
         "score",
         lambda parser: parser.add_argument("maps"),
         lambda parsed, command: int(parsed.maps != "ranks"),
         "Scores.",
         (),
-        further={"rank": further},
+        further={"rank": nested},
     )
     assert score(["ranks"]) == 0
     assert score(["rank"]) == 1

@@ -219,11 +219,11 @@ def test_each_pixel_gets_the_light_of_its_place_on_the_face(
     work = PathWork(optics.frequencies_hz, bounces=3, seed=2)
     config = RenderConfig(face_spacing_mm=30.0, face_samples=77)
     light, noise_m = face_light(none, target, direct, slopes, work, config)
-    seen = sees_face > 0
-    expected = 0.5 * evenly(x_m[seen], y_m[seen])
-    assert light == pytest.approx(np.broadcast_to(expected, (4, seen.sum())), rel=1e-6)
+    is_seen = sees_face > 0
+    expected = 0.5 * evenly(x_m[is_seen], y_m[is_seen])
+    assert light == pytest.approx(np.broadcast_to(expected, (4, is_seen.sum())), rel=1e-6)
     turned = np.full((2, 3, 1), 0.005j) * np.array([[[-1]], [[1]]])
-    total = 8.0 + np.broadcast_to(expected, (3, seen.sum()))
+    total = 8.0 + np.broadcast_to(expected, (3, is_seen.sum()))
     expected_noise_m = range_noise_m(turned, total, optics.frequencies_hz)
     assert noise_m == pytest.approx(expected_noise_m, rel=1e-3)
     assert requests[0][:2] == (work, 77)

@@ -58,9 +58,9 @@ def test_the_long_mode_of_the_o3r222_is_twice_as_noisy_as_the_short_one() -> Non
 
 def test_the_blaze_is_6_times_noisier_with_15_mhz_than_with_100() -> None:
     """The maker states less than 1 mm for both frequencies and less than 6 mm for 15 MHz alone."""
-    both = load_camera("basler_blaze101_long")
-    assert isinstance(both, AmcwCamera)
-    modulation = both.modulation
+    long_range = load_camera("basler_blaze101_long")
+    assert isinstance(long_range, AmcwCamera)
+    modulation = long_range.modulation
     slow = modulation.model_copy(
         update={
             "frequencies_hz": modulation.frequencies_hz.model_copy(update={"value": (15e6,)}),
@@ -68,12 +68,12 @@ def test_the_blaze_is_6_times_noisier_with_15_mhz_than_with_100() -> None:
             "wiggling_residual": modulation.wiggling_residual.model_copy(update={"value": (0.1,)}),
         }
     )
-    gains = both.engine.amplitude_gains.model_copy(update={"value": (1.0,)})
-    engine = both.engine.model_copy(
+    gains = long_range.engine.amplitude_gains.model_copy(update={"value": (1.0,)})
+    engine = long_range.engine.model_copy(
         update={"amplitude_gains": gains, "lattice_residual_turns": None}
     )
-    alone = both.model_copy(update={"modulation": slow, "engine": engine})
-    both_m = temporal_sigma_m(both, 5.5, 0.9, frames=40, seed=1)
+    alone = long_range.model_copy(update={"modulation": slow, "engine": engine})
+    both_m = temporal_sigma_m(long_range, 5.5, 0.9, frames=40, seed=1)
     alone_m = temporal_sigma_m(alone, 5.5, 0.9, frames=40, seed=1)
     assert 4.0 < alone_m / both_m < 6.0
 
@@ -88,8 +88,8 @@ def adi_frame(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def patches(image: np.ndarray) -> np.ndarray:
     """Return (n, pixels) the square patches of an image."""
     count = image.shape[0] // PATCH_PX
-    whole = image[: count * PATCH_PX, : count * PATCH_PX]
-    cut = whole.reshape(count, PATCH_PX, count, PATCH_PX).swapaxes(1, 2)
+    cropped = image[: count * PATCH_PX, : count * PATCH_PX]
+    cut = cropped.reshape(count, PATCH_PX, count, PATCH_PX).swapaxes(1, 2)
     return cut.reshape(-1, PATCH_PX**2).astype(float)
 
 

@@ -27,11 +27,11 @@ FINE = 40
 def sharp_edge(height: int, width: int, slope: float) -> np.ndarray:
     """Return pixels (h, w) of 100 and 400 units at both sides of a sharp edge through the middle,
     which moves by ``slope`` pixels from row to row."""
-    places = (np.arange(FINE) + 0.5) / FINE - 0.5
+    positions = (np.arange(FINE) + 0.5) / FINE - 0.5
     light = np.zeros((height, width))
     v, u = np.mgrid[:height, :width]
-    for up in places:
-        for aside in places:
+    for up in positions:
+        for aside in positions:
             edge = width / 2 + slope * (v + up - height / 2)
             light += u + aside > edge
     return 100 + 300 * light / FINE**2
@@ -58,7 +58,7 @@ def test_photon_transfer_gives_gain_and_read_noise_back():
     rng = np.random.default_rng(1)
     contrasts = (0.87, 0.88, 0.96)
     image = np.empty((1000, 100 * (len(LEVELS) - 1)))
-    for place, level in enumerate(LEVELS[:-1]):
+    for number, level in enumerate(LEVELS[:-1]):
         # both wells' electrons, of which each of three frequencies has an amplitude
         both_wells = level * 1.1 / 0.9697 * per_unit / sum(contrasts)
         total = np.zeros((1000, 100))
@@ -69,7 +69,7 @@ def test_photon_transfer_gives_gain_and_read_noise_back():
             real = (samples * np.cos(phases)).sum(axis=-1)
             imaginary = (samples * np.sin(phases)).sum(axis=-1)
             total += 2 / 3 * np.hypot(real, imaginary)
-        image[:, 100 * place : 100 * place + 100] = 0.9697 * total
+        image[:, 100 * number : 100 * number + 100] = 0.9697 * total
     terms = photon_transfer(image)
     gain, noise = electrons(terms, sum(contrasts))
     assert gain == pytest.approx(per_unit, rel=0.1)

@@ -102,12 +102,12 @@ def test_a_frame_is_that_of_its_table(as_file: bool, tmp_path: Path) -> None:
         stored = tmp_path / "noise.npz"
         np.savez(stored, **facts)
     noise = DepthNoise(stored, seed=4)
-    own = np.random.default_rng(4).standard_normal(SHAPE, dtype=f4)
-    pattern_m = 2e-3 * blurred(own, facts["pattern_rows"], facts["pattern_columns"])
+    standard = np.random.default_rng(4).standard_normal(SHAPE, dtype=f4)
+    pattern_m = 2e-3 * blurred(standard, facts["pattern_rows"], facts["pattern_columns"])
     assert noise.pattern_m == pytest.approx(pattern_m, abs=1e-8)
     assert noise.shape == SHAPE
     assert noise.cosine == pytest.approx(1 / noise.stretch)
-    known = 0
+    finite_count = 0
     for frame in range(20):
         same = np.random.default_rng(frame)
         white = same.standard_normal(SHAPE, dtype=f4)
@@ -120,8 +120,8 @@ def test_a_frame_is_that_of_its_table(as_file: bool, tmp_path: Path) -> None:
         assert np.array_equal(np.isnan(drawn), np.isnan(wanted))
         assert np.nanmax(off) < 1.01
         assert np.nanmean(off > 0.5) < 0.1
-        known += np.isfinite(drawn).sum()
-    assert known > 150
+        finite_count += np.isfinite(drawn).sum()
+    assert finite_count > 150
 
 
 def test_other_rays_have_no_falloff_and_numbers_may_be_unrounded() -> None:
@@ -190,8 +190,8 @@ def test_a_batch_for_torch_has_frames_of_the_same_table(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "torch", TORCH)  # type: ignore[arg-type]
     facts = table()
     noise = TorchDepthNoise(facts, seed=4)
-    own = np.random.default_rng(4).standard_normal(SHAPE, dtype=f4)
-    pattern_m = 2e-3 * blurred(own, facts["pattern_rows"], facts["pattern_columns"])
+    standard = np.random.default_rng(4).standard_normal(SHAPE, dtype=f4)
+    pattern_m = 2e-3 * blurred(standard, facts["pattern_rows"], facts["pattern_columns"])
     assert np.asarray(noise.pattern_m) == pytest.approx(pattern_m, abs=1e-8)
     z_m, intensity = scene()
     for seed in range(8):

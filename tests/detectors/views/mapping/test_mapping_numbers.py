@@ -254,12 +254,12 @@ def test_the_noise_of_depth_follows_the_amplitude() -> None:
     assert repeated
     np.testing.assert_allclose(variance, sigma_m**2 / COUNT, rtol=0.12)
     # pixels without an amplitude count like the median one; with a tenth of them it is no measure
-    few = np.where(np.arange(200) < 15, 0.0, amplitude)
-    variance, _ = depth_noise(replace(cloud, amplitude=few), INSIDE, amplitude * np.nan)
+    few_dark = np.where(np.arange(200) < 15, 0.0, amplitude)
+    variance, _ = depth_noise(replace(cloud, amplitude=few_dark), INSIDE, amplitude * np.nan)
     typical = np.median(sigma_m**2)
     assert variance[40, 5] * COUNT[40, 5] == pytest.approx(typical, rel=0.15)
-    many = np.where(np.arange(200) < 25, np.nan, amplitude)
-    without, _ = depth_noise(replace(cloud, amplitude=many), INSIDE, amplitude * np.nan)
+    gappy = np.where(np.arange(200) < 25, np.nan, amplitude)
+    without, _ = depth_noise(replace(cloud, amplitude=gappy), INSIDE, amplitude * np.nan)
     plain, _ = depth_noise(replace(cloud, amplitude=None), INSIDE, amplitude * np.nan)
     np.testing.assert_array_equal(without, plain)
 
@@ -298,11 +298,11 @@ def test_the_mean_of_rounded_distances_keeps_an_error_of_rounding() -> None:
     """Frames that scatter by q / sqrt 12 or less, and such that scatter by 0.4 q more."""
     step_m = 1e-3
     ones = np.ones((150, 200))
-    many = np.full((150, 200), 400)
+    counts = np.full((150, 200), 400)
     for dither_m in (0.0, 0.4e-3):
         sigma_m = np.sqrt(step_m**2 / 12.0 + dither_m**2) * ones
-        cloud = replace(averaged(0.8 * ones, sigma_m, many), z_step_m=step_m)
-        variance, _ = depth_noise(cloud, INSIDE, np.full(many.shape, np.nan))
+        cloud = replace(averaged(0.8 * ones, sigma_m, counts), z_step_m=step_m)
+        variance, _ = depth_noise(cloud, INSIDE, np.full(counts.shape, np.nan))
         left_m2 = rounding_left_m2(step_m, dither_m**2)
         expected = sigma_m[0, 0] ** 2 / 400 + left_m2
         assert float(np.median(variance)) == pytest.approx(expected, rel=0.03)
@@ -319,32 +319,32 @@ def test_cells_hold_the_mean_of_their_parts(organised: bool, parts: int) -> None
     spacings; a cell is unknown if less than half of it is covered."""
     random = np.random.default_rng(10)
     v, u = np.mgrid[:16, :21].astype(float)
-    places = np.stack([u, v], axis=-1) + 0.1 * random.standard_normal((16, 21, 2))
-    places[[0, -1]] = np.stack([u, v], axis=-1)[[0, -1]]
-    places[:, [0, -1]] = np.stack([u, v], axis=-1)[:, [0, -1]]
-    values = 5.0 + 2.0 * places[..., 0] - 3.0 * places[..., 1]
+    positions = np.stack([u, v], axis=-1) + 0.1 * random.standard_normal((16, 21, 2))
+    positions[[0, -1]] = np.stack([u, v], axis=-1)[[0, -1]]
+    positions[:, [0, -1]] = np.stack([u, v], axis=-1)[:, [0, -1]]
+    values = 5.0 + 2.0 * positions[..., 0] - 3.0 * positions[..., 1]
     # cells from -2 on: the samples begin in the middle of a cell or between two
     grid = CellGrid(-2.0, -1.0, float(parts), (20 // parts, 26 // parts))
     if not organised:
-        places = places.reshape(1, -1, 2)
-    raster = raster_between(places, np.ones(places.shape[:2], bool), organised, 1.0, grid)
+        positions = positions.reshape(1, -1, 2)
+    raster = raster_between(positions, np.ones(positions.shape[:2], bool), organised, 1.0, grid)
     result = raster.at_cells(values.ravel())
     x, y = grid.places()
-    known = np.zeros(grid.shape, bool)
+    is_known = np.zeros(grid.shape, bool)
     for row, column in np.ndindex(*grid.shape):
         offsets = np.arange(parts) - (parts - 1) / 2
         part_x = x[row, column] + offsets
         part_y = y[row, column] + offsets
         inside = ((part_x >= 0) & (part_x <= 20))[None] & ((part_y >= 0) & (part_y <= 15))[:, None]
-        known[row, column] = 2 * inside.sum() >= parts**2
+        is_known[row, column] = 2 * inside.sum() >= parts**2
         if inside.all():
             expected = 5.0 + 2.0 * x[row, column] - 3.0 * y[row, column]
             assert result[row, column] == pytest.approx(expected, abs=1e-9)
-    np.testing.assert_array_equal(np.isfinite(result), known)
-    assert known.any()
-    assert not known.all()
+    np.testing.assert_array_equal(np.isfinite(result), is_known)
+    assert is_known.any()
+    assert not is_known.all()
     sums = np.asarray(raster.weights.sum(axis=1)).reshape(grid.shape)
-    np.testing.assert_allclose(sums[known], 1.0)
+    np.testing.assert_allclose(sums[is_known], 1.0)
     squares = np.asarray((raster.weights.toarray() ** 2).sum(axis=1)).reshape(grid.shape)
     np.testing.assert_allclose(raster.concentration, squares)
 
@@ -354,9 +354,9 @@ def test_triangles_without_a_grid_do_not_cross_a_gap() -> None:
     v, u = np.mgrid[:12, :12].astype(float)
     diagonal = np.sqrt(LONGEST_EDGE**2 - 1.0)
     for gap, is_crossed in ((diagonal - 0.05, True), (LONGEST_EDGE + 0.05, False)):
-        places = np.stack([u + np.where(u > 5, gap - 1.0, 0.0), v], axis=-1).reshape(1, -1, 2)
+        positions = np.stack([u + np.where(u > 5, gap - 1.0, 0.0), v], axis=-1).reshape(1, -1, 2)
         grid = CellGrid(7.0, 3.0, 1.0, (3, 1))
-        raster = raster_between(places, np.ones((1, 144), bool), False, 1.0, grid)
+        raster = raster_between(positions, np.ones((1, 144), bool), False, 1.0, grid)
         assert np.isfinite(raster.at_cells(np.ones(144))).all() == is_crossed
 
 

@@ -275,8 +275,10 @@ def test_the_error_of_a_blob_with_mixed_rims_has_its_rim_and_the_strays_around(p
         np.testing.assert_allclose(blob.grid_covariance, expected, rtol=1e-9, atol=1e-15)
         contrast = [np.log((BOARD + 101.0) / (BOARD + 1.0)), 0.0, 0.0]
         np.testing.assert_allclose(blob.contrast, contrast, atol=1e-9)
-        places = np.stack([blob.pixels % LENS.width, blob.pixels // LENS.width], axis=1)
-        np.testing.assert_allclose(places - blob.grid, (places - blob.grid)[0] + 0 * places)
+        positions = np.stack([blob.pixels % LENS.width, blob.pixels // LENS.width], axis=1)
+        np.testing.assert_allclose(
+            positions - blob.grid, (positions - blob.grid)[0] + 0 * positions
+        )
         np.testing.assert_array_equal(
             np.sort(blob.pixels[blob.weights > 1e-9]), np.flatnonzero(outer)
         )
@@ -323,8 +325,8 @@ def test_uneven_light_is_taken_out_of_the_colours(slope) -> None:
     light = 1.0 + slope[0] * (U - 70.0) / 100.0 + slope[1] * (V - 60.0) / 100.0
     window = np.s_[20:120, 10:150]
     even = _evenly_lit((colours * light[..., None])[window], ring[window], group[window])
-    near = within(70.0, 60.0, 61, 41)[window]
-    np.testing.assert_allclose(even[near], colours[window][near], rtol=1e-9)
+    blob = within(70.0, 60.0, 61, 41)[window]
+    np.testing.assert_allclose(even[blob], colours[window][blob], rtol=1e-9)
 
 
 def test_light_is_taken_to_change_by_a_factor_of_two_at_most() -> None:
@@ -425,8 +427,8 @@ def test_the_range_error_is_the_largest_of_three_and_shared_by_25_pixels() -> No
     pixels = np.arange(500, 600)
     by_scatter = patch.range_covariance_m2(centre, cloud, pixels)
     np.testing.assert_allclose(by_scatter, 4e-8 * 0.25 * np.outer(along, along), rtol=1e-12)
-    few = patch.range_covariance_m2(centre, cloud, pixels[:10])
-    np.testing.assert_allclose(few, 4e-8 * np.outer(along, along), rtol=1e-12)
+    of_few = patch.range_covariance_m2(centre, cloud, pixels[:10])
+    np.testing.assert_allclose(of_few, 4e-8 * np.outer(along, along), rtol=1e-12)
     frames = replace(cloud, variance_m2=np.full(V.shape, 5e-7), count=np.full(V.shape, 5))
     by_frames = patch.range_covariance_m2(centre, frames, pixels)
     np.testing.assert_allclose(by_frames, 1e-7 * 0.25 * np.outer(along, along), rtol=1e-12)

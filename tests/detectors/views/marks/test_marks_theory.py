@@ -199,8 +199,8 @@ def test_the_contrast_is_in_deviations_and_the_margin_in_limits(dimensions: int)
     random = np.random.default_rng(6)
     xy = random.uniform(-1.0, 1.0, (40_000, 2))
     root = np.array([[0.02, 0.0], [0.015, 0.01]])[:dimensions, :dimensions]
-    own = random.standard_normal((40_000, dimensions)) @ root.T
-    features = own + 0.3 + 0.1 * xy[:, :1] - 0.2 * xy[:, :1] * xy[:, 1:]
+    own_errors = random.standard_normal((40_000, dimensions)) @ root.T
+    features = own_errors + 0.3 + 0.1 * xy[:, :1] - 0.2 * xy[:, :1] * xy[:, 1:]
     contrast, margin = stand_out(features, np.full(40_000, 1e-9), xy)
     for share in (0.25, 0.5, 0.9):
         expected = stats.chi.ppf(share, dimensions)

@@ -108,13 +108,13 @@ def test_a_sandwich_is_that_of_sums_over_cubes() -> None:
     np.testing.assert_array_equal(result, result.T)
     # the objective's unit does not matter, nor that of length
     for unit in (1e-14, 1e14):
-        other = registered.clustered_sandwich(unit * curvature, unit * scores, points, PITCH_M)
-        np.testing.assert_allclose(other, result, rtol=1e-9)
+        scaled = registered.clustered_sandwich(unit * curvature, unit * scores, points, PITCH_M)
+        np.testing.assert_allclose(scaled, result, rtol=1e-9)
     longer = np.array([1.0] * 3 + [1e6] * 3)
-    other = registered.clustered_sandwich(
+    scaled = registered.clustered_sandwich(
         curvature / np.outer(longer, longer), scores / longer, 1e6 * points, 1e6 * PITCH_M
     )
-    np.testing.assert_allclose(other / np.outer(longer, longer), result, rtol=1e-7)
+    np.testing.assert_allclose(scaled / np.outer(longer, longer), result, rtol=1e-7)
 
 
 def test_a_sandwich_needs_seven_cubes_and_a_definite_curvature() -> None:
@@ -124,8 +124,8 @@ def test_a_sandwich_needs_seven_cubes_and_a_definite_curvature() -> None:
     scores = random.standard_normal((21, 6))
     definite = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     assert np.isfinite(registered.clustered_sandwich(definite, scores, points, PITCH_M)).all()
-    few = registered.clustered_sandwich(definite, scores[:18], points[:18], PITCH_M)
-    assert np.isnan(few).all()
+    of_few = registered.clustered_sandwich(definite, scores[:18], points[:18], PITCH_M)
+    assert np.isnan(of_few).all()
     for worst in (-1e-3, 0.0):
         indefinite = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, worst])
         assert np.isnan(registered.clustered_sandwich(indefinite, scores, points, PITCH_M)).all()
@@ -188,8 +188,8 @@ def test_a_covariance_is_widened_by_what_noise_does_not_explain() -> None:
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-8
     registration = registered.Registration("v", "marks", np.eye(4), covariance=covariance)
     normal = np.array([0.6, 0.0, -0.8])
-    seen = agreement(noise_m=1e-3, grids_m=3e-4, apart_m=2e-3, marks_m=5e-3)
-    result = register._widened(registration, normal, 4e-4, 5e-4, seen)
+    measured = agreement(noise_m=1e-3, grids_m=3e-4, apart_m=2e-3, marks_m=5e-3)
+    result = register._widened(registration, normal, 4e-4, 5e-4, measured)
     across_mm2 = 4.0 - (1.0 + 0.25)
     within_mm2 = 25.0 - (1.0 + 0.25 + 0.16 + 0.09 + across_mm2)
     along = np.outer(normal, normal)
@@ -200,7 +200,7 @@ def test_a_covariance_is_widened_by_what_noise_does_not_explain() -> None:
     sizes = f"{np.sqrt(across_mm2):.2g} mm across and {np.sqrt(within_mm2):.2g} mm along"
     assert sizes in result.notes[0]
     # what the scatter allows is no such error
-    quiet = replace(seen, apart_m=1.19 * np.hypot(1e-3, 5e-4), marks_m=1.29e-3 * np.sqrt(1.5))
+    quiet = replace(measured, apart_m=1.19 * np.hypot(1e-3, 5e-4), marks_m=1.29e-3 * np.sqrt(1.5))
     assert register._widened(registration, normal, 4e-4, 5e-4, quiet) is registration
     loud = replace(quiet, apart_m=1.21 * np.hypot(1e-3, 5e-4))
     widened = register._widened(registration, normal, 4e-4, 5e-4, loud)
@@ -398,8 +398,8 @@ def test_twin_placements_need_odds_of_90_to_1(guess_deg: float, is_clear: bool) 
     """A rectangle and its half turn: with the guess turned by an angle from the first, the root
     mean squares from it are 0.2 m sin and cos of half of the angle, so that over 50 mm the odds
     are 8 times its cosine: 4.5 at 55.8 degrees."""
-    places = np.column_stack([RECTANGLE_M, np.full(4, 0.7)])
-    marks = [mark_at(place) for place in places]
+    centres = np.column_stack([RECTANGLE_M, np.full(4, 0.7)])
+    marks = [mark_at(centre) for centre in centres]
     turn = np.array([0.0, 0.0, np.deg2rad(guess_deg), 0.0, 0.0, 0.0])
     guess = moved_by(turn, np.array([0.0, 0.0, 0.7]))
     pairing = pair_marks(marks, marks, guess)
@@ -417,13 +417,13 @@ def test_a_mark_is_matched_within_the_limit_of_chi_square() -> None:
     """One of six marks is moved across its plane; both have 0.1 mm of noise and 1 mm that views do
     not share."""
     random = np.random.default_rng(12)
-    places = np.column_stack([random.uniform(-0.2, 0.2, (6, 2)), np.full(6, 0.8)])
-    marks = [mark_at(place) for place in places]
+    centres = np.column_stack([random.uniform(-0.2, 0.2, (6, 2)), np.full(6, 0.8)])
+    marks = [mark_at(centre) for centre in centres]
     deviation = np.sqrt(2 * (1e-3**2 + 1e-4**2))
     for sigmas, is_matched in ((0.5, True), (12.0, False)):
-        moved = places.copy()
+        moved = centres.copy()
         moved[2, 2] += sigmas * deviation
-        pairing = pair_marks(marks, [mark_at(place) for place in moved], None)
+        pairing = pair_marks(marks, [mark_at(centre) for centre in moved], None)
         assert pairing.problem == ""
         assert (2 in pairing.pairs[:, 0]) == is_matched
         np.testing.assert_array_equal(pairing.pairs[:, 0], pairing.pairs[:, 1])
@@ -438,9 +438,9 @@ def test_a_mark_is_matched_within_the_limit_of_chi_square() -> None:
 def test_marks_on_a_line_are_told(off_mm, sigma_mm, is_line) -> None:
     """Four marks whose distance from their line is a root mean square of 2 % of that along it, or
     five deviations of a mark, whichever is more."""
-    places = np.array([[-0.2, 0.0, 0.7], [0.2, 0.0, 0.7], [-0.2, 0.0, 0.7], [0.2, 0.0, 0.7]])
-    places[:, 1] = np.array([1.0, 1.0, -1.0, -1.0]) * off_mm * 1e-3
-    text = off_line_problem([mark_at(place, sigma_mm * 1e-3) for place in places])
+    centres = np.array([[-0.2, 0.0, 0.7], [0.2, 0.0, 0.7], [-0.2, 0.0, 0.7], [0.2, 0.0, 0.7]])
+    centres[:, 1] = np.array([1.0, 1.0, -1.0, -1.0]) * off_mm * 1e-3
+    text = off_line_problem([mark_at(centre, sigma_mm * 1e-3) for centre in centres])
     assert bool(text) == is_line
     if is_line:
         assert f"{off_mm:.1f} mm off it" in text
@@ -465,8 +465,8 @@ def plain_residuals(state: JointState, data: list[ViewData]) -> tuple[np.ndarray
             height += (state.surface[term] + state.view_terms[v, term]) * along_x * along_y
         parts.append(z - height)
         for mark, label in view.marks:
-            place = transform_points(state.T[v], mark.centre_m)
-            parts.append(place[:2] - state.marks_m[label])
+            centre = transform_points(state.T[v], mark.centre_m)
+            parts.append(centre[:2] - state.marks_m[label])
         parts.append(state.view_terms[v])
     return np.concatenate(parts), [len(part) for part in parts]
 
@@ -491,14 +491,14 @@ def test_the_normal_equations_are_those_of_numerical_derivatives() -> None:
         across = random.normal(size=(40, 2)) * [0.08, 0.06]
         # some points are far off
         height = 1e-3 * random.standard_t(2, size=(40, 1))
-        seen = transform_points(np.linalg.inv(T[v]), np.hstack([across, height]))
+        points = transform_points(np.linalg.inv(T[v]), np.hstack([across, height]))
         marks = []
         for label in labels:
-            place = np.append(state.marks_m[label] + 1e-3 * random.normal(size=2), 0.0)
+            centre = np.append(state.marks_m[label] + 1e-3 * random.normal(size=2), 0.0)
             root = 1e-4 * random.normal(size=(3, 3))
-            mark = mark_at(transform_points(np.linalg.inv(T[v]), place))
+            mark = mark_at(transform_points(np.linalg.inv(T[v]), centre))
             marks.append((replace(mark, covariance_m2=root @ root.T), label))
-        data.append(ViewData(seen, tuple(marks), noise_m=2e-4, sigma_m=9e-4))
+        data.append(ViewData(points, tuple(marks), noise_m=2e-4, sigma_m=9e-4))
     residuals, sizes = plain_residuals(state, data)
     weights = []
     position = 0
@@ -555,8 +555,8 @@ def test_a_judged_view_s_covariance_gains_what_it_does_not_explain_across() -> N
     points = np.column_stack([grid, np.full(len(grid), 0.8)])
     random = np.random.default_rng(17)
     reference = view_of(points + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
-    apart = np.array([0.0, 0.0, 1.5e-3])
-    view = view_of(points + apart + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
+    offset_m = np.array([0.0, 0.0, 1.5e-3])
+    view = view_of(points + offset_m + 1e-4 * random.standard_normal((len(points), 1)) * [0, 0, 1])
     covariance = np.diag([0.0, 0.0, 0.0, 1e-6, 1e-6, 4e-8])
     registration = registered.Registration(
         "v", "icp", np.eye(4), covariance=covariance, centre_m=points.mean(axis=0)

@@ -199,13 +199,13 @@ def test_units_of_size_and_signal_do_not_matter(
     size, signal = study(5)
     fit = fit_ahat(size, signal, decision=2.0, left=1.5, right=3.1, log_size=log_size)
     decision = (2.0 + offset) * gain
-    left = (1.5 + offset) * gain
+    floor = (1.5 + offset) * gain
     right = (3.1 + offset) * gain
     scaled = fit_ahat(
         size * unit,
         (signal + offset) * gain,
         decision=decision,
-        left=left,
+        left=floor,
         right=right,
         log_size=log_size,
     )

@@ -111,8 +111,8 @@ def test_the_likelihood_is_the_sum_over_hits_and_misses(link: str) -> None:
     data = data_of(link, offset=0.2)
     assert data.value(b) == pytest.approx(expected, rel=1e-12)
     several = data.value(np.stack([b, b + 0.5]))
-    each = [float(data.value(b)), float(data.value(b + 0.5))]
-    assert several.tolist() == pytest.approx(each, rel=1e-13)
+    values = [float(data.value(b)), float(data.value(b + 0.5))]
+    assert several.tolist() == pytest.approx(values, rel=1e-13)
 
 
 @pytest.mark.parametrize("link", LINKS)
@@ -192,12 +192,12 @@ def test_plain_steps_reach_the_maximum_of_data_that_overlap(
     monkeypatch.setattr(curves, "ascend", search)
     maxima(studies_of(data_of(link)), np.array([0.0, 0.5]))
     assert searched == [[]]
-    both = replace(
+    combined = replace(
         studies_of(data_of(link)),
         hits=np.stack([HITS, (SIZES > 0.1).astype(float)]),
         misses=np.stack([MISSES, (SIZES <= 0.1).astype(float)]),
     )
-    b = maxima(both, np.array([0.0, 0.5]))
+    b = maxima(combined, np.array([0.0, 0.5]))
     assert searched[1] in ([], [[0.0, 0.5]])
     assert b[0] == pytest.approx(maxima(studies_of(data_of(link)), np.array([0.0, 0.5]))[0])
 

@@ -240,10 +240,10 @@ def test_a_band_in_blocks_of_curves_is_the_same(monkeypatch: pytest.MonkeyPatch)
     """Memory for less than one curve is memory for one curve at a time."""
     fit = fit_hit_miss(*simulated(60, seed=5))
     at_mm = np.array([2.5, 4.0, 6.0])
-    whole = band(fit, at_mm)
+    complete = band(fit, at_mm)
     for cells in (59, 200):
         monkeypatch.setattr(hit_miss, "CELLS", cells)
-        for level, expected in zip(band(fit, at_mm), whole, strict=True):
+        for level, expected in zip(band(fit, at_mm), complete, strict=True):
             assert level == pytest.approx(expected, rel=1e-9)
 
 
@@ -467,8 +467,8 @@ def test_p_values_of_floor_and_ceiling_are_those_of_the_mixtures(seed: int, repe
             )
             losses.append(end.fun)
         statistic = 2 * (-min(losses) - fit.log_likelihood / repeats)
-        one, two = stats.chi2.sf(statistic, [1, 2])
-        expected = 0.5 * one + 0.25 * two if test.beyond == "both" else 0.5 * one
+        tail_of_one, two = stats.chi2.sf(statistic, [1, 2])
+        expected = 0.5 * tail_of_one + 0.25 * two if test.beyond == "both" else 0.5 * tail_of_one
         if statistic < 1e-6:  # neither fits better
             expected = 1.0
         else:

@@ -84,8 +84,8 @@ def test_the_first_boards_have_no_chosen_sizes():
 
 
 def test_set_ups_that_are_still_wide_share_the_boards():
-    other = Stub((8.0, 8.5), (9.0, 10.0), "other")
-    sizes_mm = np.ravel(after(START, WIDE, other, NARROW).chosen_mm)
+    second = Stub((8.0, 8.5), (9.0, 10.0), "other")
+    sizes_mm = np.ravel(after(START, WIDE, second, NARROW).chosen_mm)
     assert np.mean(sizes_mm < 7.51) == pytest.approx(0.5)
     assert np.mean((sizes_mm > 8.1) & (sizes_mm < 9.8)) == pytest.approx(0.5)
 

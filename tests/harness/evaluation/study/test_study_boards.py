@@ -65,13 +65,13 @@ def test_blocks_hold_as_many_draws_as_the_memory_allows() -> None:
 def test_refitted_sizes_without_an_overlap() -> None:
     """All found: the smallest size. Nothing found: no size."""
     size_mm = np.linspace(2.0, 9.0, 12)
-    found = refitted_sizes(targets(size_mm, np.ones(12)), CURVE, (0.5, 0.9), 5)
-    assert found == pytest.approx(2.0)
+    refitted = refitted_sizes(targets(size_mm, np.ones(12)), CURVE, (0.5, 0.9), 5)
+    assert refitted == pytest.approx(2.0)
     missed = refitted_sizes(targets(size_mm, np.zeros(12)), CURVE, (0.5, 0.9), 5)
     assert np.isinf(missed).all()
     logarithmic = PodCurve("logit", True, 1.5, 0.3, np.zeros((2, 2)))
-    found = refitted_sizes(targets(size_mm, np.ones(12)), logarithmic, (0.9,), 5)
-    assert found == pytest.approx(2.0)
+    refitted = refitted_sizes(targets(size_mm, np.ones(12)), logarithmic, (0.9,), 5)
+    assert refitted == pytest.approx(2.0)
 
 
 def test_units_are_resampled_beside_boards() -> None:

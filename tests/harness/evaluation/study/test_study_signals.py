@@ -78,8 +78,8 @@ def test_it_covers_the_truth_and_scatters_less_than_hits():
 def test_what_is_missed_says_nothing_but_that():
     record = studied(0)
     hit = record.inspected.hit
-    other = with_signal(record, np.where(hit, record.inspected.signal, 0.1))
-    assert sizes(other).a50_mm == sizes(record).a50_mm
+    fainter = with_signal(record, np.where(hit, record.inspected.signal, 0.1))
+    assert sizes(fainter).a50_mm == sizes(record).a50_mm
 
 
 def test_what_is_found_by_missing_returns_lies_above_the_threshold():
@@ -105,7 +105,9 @@ def test_boards_that_differ_widen_the_interval_as_a_jackknife_does():
         }
         without = dataclasses.replace(record.inspected, **columns)
         lines = sizes(dataclasses.replace(record, inspected=without)).lines
-        axes = {(other.fit.log_size, other.fit.log_signal): other for other in lines}
+        axes = {
+            (candidate.fit.log_size, candidate.fit.log_signal): candidate for candidate in lines
+        }
         same = axes[(line.fit.log_size, line.fit.log_signal)]
         sizes_mm.append(same.fit.curve.size_at(0.9))
     jackknife = (CASE.boards - 1) * np.var(sizes_mm)
@@ -193,10 +195,10 @@ class TestChange:
         threshold = record.threshold + 0.4
         hit = record.inspected.hit & (record.inspected.signal > threshold)
         inspected = dataclasses.replace(record.inspected, hit=hit)
-        other = limit_of(
+        second = limit_of(
             dataclasses.replace(record, threshold=threshold, inspected=inspected), draws=2
         )
-        moved = signal_limit_change(same, other)
+        moved = signal_limit_change(same, second)
         assert moved is not None
         assert moved.ratio > 1.03
         # one of two standard errors, with a little of the boards besides
@@ -205,8 +207,8 @@ class TestChange:
     def test_it_needs_the_same_boards_and_lines(self):
         record = studied(9)
         inspected = dataclasses.replace(record.inspected, board=record.inspected.board + 1)
-        other = dataclasses.replace(record, inspected=inspected)
+        second = dataclasses.replace(record, inspected=inspected)
         limit = limit_of(record, draws=2)
-        assert signal_limit_change(limit, limit_of(other, draws=2)) is None
+        assert signal_limit_change(limit, limit_of(second, draws=2)) is None
         without = dataclasses.replace(limit, from_signals=SignalSizes(why="none"))
         assert signal_limit_change(limit, without) is None

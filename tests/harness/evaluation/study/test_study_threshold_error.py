@@ -108,16 +108,16 @@ def test_equal_thresholds_are_drawn_again_alike_and_others_independently() -> No
     rows = dataclasses.replace(rows_of(record), threshold=5.0)
     first = refitted_sizes(rows, curve, (0.9,), 200)[0]
     again = refitted_sizes(rows, curve, (0.9,), 200)[0]
-    other = refitted_sizes(dataclasses.replace(rows, threshold=5.1), curve, (0.9,), 200)[0]
+    refitted = refitted_sizes(dataclasses.replace(rows, threshold=5.1), curve, (0.9,), 200)[0]
     fixed = dataclasses.replace(rows, excess=None)
     of_boards = refitted_sizes(fixed, curve, (0.9,), 200)[0]
     assert np.array_equal(first, again)
     # what the thresholds add to the boards' draws
     added = np.log(first / of_boards)
-    added_to_other = np.log(other / of_boards)
-    known = np.isfinite(added) & np.isfinite(added_to_other)
-    assert abs(np.corrcoef(added[known], added_to_other[known])[0, 1]) < 0.25
-    assert np.std(added[known]) == pytest.approx(ERROR / SIGNAL_PER_MM / 7.76, rel=0.4)
+    added_to_other = np.log(refitted / of_boards)
+    is_finite = np.isfinite(added) & np.isfinite(added_to_other)
+    assert abs(np.corrcoef(added[is_finite], added_to_other[is_finite])[0, 1]) < 0.25
+    assert np.std(added[is_finite]) == pytest.approx(ERROR / SIGNAL_PER_MM / 7.76, rel=0.4)
     assert limit_of(record, draws=200).a90_draws_mm == pytest.approx(
         np.maximum(
             refitted_sizes(rows, limit_of(record, draws=2).statement.curve, (0.9,), 200)[0], 0

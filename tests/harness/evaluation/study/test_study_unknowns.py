@@ -76,7 +76,7 @@ def test_intervals_cover_the_truth():
     """36 boards, 40 studies: each interval of a backing holds its a90, and that of the blur its
     factor, in 85 to 98 % of them (binomial: 31 or more of 40)."""
     covered = np.zeros(4, int)
-    found = 0
+    beyond_chance = 0
     for seed in range(40):
         judged = over_unknowns(drawn_set_up(seed=seed), draws=150)
         by_key = {effect.unknown.key: effect for effect in judged.effects}
@@ -86,9 +86,9 @@ def test_intervals_cover_the_truth():
         interval = blur.factor_interval
         factor = BLUR_FACTOR if blur.highest_level == 1 else 1 / BLUR_FACTOR
         covered[3] += interval.low <= factor <= interval.high
-        found += by_key[BACKING].beyond_chance
+        beyond_chance += by_key[BACKING].beyond_chance
     assert covered.min() >= 31
-    assert found >= 36
+    assert beyond_chance >= 36
 
 
 def test_intervals_are_stretched_for_the_coefficients_that_the_boards_determine(monkeypatch):
@@ -118,20 +118,20 @@ def test_the_confidence_of_what_matters_allows_for_all_pairs_of_values(monkeypat
 
 def test_chance_is_seldom_said_to_matter():
     """None of three unknowns does anything: one is named in 5 % of studies (6 or fewer of 40)."""
-    named = 0
+    decided = 0
     for seed in range(40):
         judged = over_unknowns(drawn_set_up(seed=seed, idle_only=True), draws=200)
-        named += bool(judged.deciding)
+        decided += bool(judged.deciding)
         if not judged.deciding:
             assert judged.lowest_mm == judged.highest_mm
-    assert named <= 6
+    assert decided <= 6
 
 
 def test_the_same_numbers_each_time():
     first, second = (over_unknowns(drawn_set_up(), draws=50) for _ in range(2))
-    for one, other in zip(first.effects, second.effects, strict=True):
-        assert one.a90_mm.tolist() == other.a90_mm.tolist()
-        assert one.factor_interval == other.factor_interval
+    for effect, repeated_effect in zip(first.effects, second.effects, strict=True):
+        assert effect.a90_mm.tolist() == repeated_effect.a90_mm.tolist()
+        assert effect.factor_interval == repeated_effect.factor_interval
 
 
 def test_repeats_of_the_noise_are_no_further_boards():
@@ -145,16 +145,18 @@ def test_repeats_of_the_noise_are_no_further_boards():
     columns["repeat"] = np.repeat([0, 1], len(once.hit))
     twice = over_unknowns(replace(record, inspected=replace(once, **columns)), draws=50)
     plain = over_unknowns(record, draws=50)
-    for one, other in zip(plain.effects, twice.effects, strict=True):
-        assert other.a90_mm == pytest.approx(one.a90_mm, rel=5e-3)
-        assert other.factor_interval.high == pytest.approx(one.factor_interval.high, rel=0.02)
+    for effect, doubled_effect in zip(plain.effects, twice.effects, strict=True):
+        assert doubled_effect.a90_mm == pytest.approx(effect.a90_mm, rel=5e-3)
+        assert doubled_effect.factor_interval.high == pytest.approx(
+            effect.factor_interval.high, rel=0.02
+        )
 
 
 def test_without_unknowns_or_without_enough_boards():
     assert over_unknowns(study_record().set_ups[0]) is None
-    few = over_unknowns(drawn_set_up(boards=14))
-    assert few.why == "14 boards are too few to tell the unknowns apart; 15 are needed"
-    assert few.effects == ()
+    of_few_boards = over_unknowns(drawn_set_up(boards=14))
+    assert of_few_boards.why == "14 boards are too few to tell the unknowns apart; 15 are needed"
+    assert of_few_boards.effects == ()
     assert over_unknowns(drawn_set_up(boards=15), draws=20).why == ""
     record = drawn_set_up()
     all_found = replace(record.inspected, hit=np.ones_like(record.inspected.hit))

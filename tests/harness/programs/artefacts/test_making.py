@@ -203,9 +203,9 @@ def test_a_quick_run_of_a_sweep_keeps_all_its_set_ups() -> None:
     """Documents quote them by name; a first look by hand leaves some out."""
     file = provenance.ROOT / "experiments" / "today.yaml"
     _, sweep = making._with_all_set_ups("experiments/today.yaml")
-    whole = load_experiment(file, [sweep], quick=True).config
-    assert whole.sweep == load_experiment(file).config.sweep
-    assert whole.sweep != load_experiment(file, quick=True).config.sweep
+    complete = load_experiment(file, [sweep], quick=True).config
+    assert complete.sweep == load_experiment(file).config.sweep
+    assert complete.sweep != load_experiment(file, quick=True).config.sweep
 
 
 def test_what_fails_is_named_and_the_rest_is_made(
@@ -214,8 +214,8 @@ def test_what_fails_is_named_and_the_rest_is_made(
     text = DECLARED.replace('python -c "print(1)"', 'python -c "exit(3)"')
     (checkout / "artefacts.yaml").write_text(text)
     run(code=1)
-    said = capsys.readouterr().err
-    assert "ended with exit code 3" in said and "not made: copy" in said
+    errors = capsys.readouterr().err
+    assert "ended with exit code 3" in errors and "not made: copy" in errors
     assert set(read_ledger()) == {"numbers"}
 
 

@@ -87,7 +87,7 @@ def test_every_picture_and_table_of_data_is_an_artefacts():
 
 def tables_of(text: str) -> list[tuple[int, str]]:
     """(index, text) of every table in Markdown."""
-    return [(found.start(), found[0]) for found in re.finditer(r"(?m)^(?:\|.*\n){3,}", text)]
+    return [(match.start(), match[0]) for match in re.finditer(r"(?m)^(?:\|.*\n){3,}", text)]
 
 
 def share_of_numbers(table: str) -> float:

@@ -25,14 +25,14 @@ SHORT = (PreciseCase(StudyCase("steep", 0.2), 5.0),)
 
 
 def test_the_true_sizes_are_those_of_a_board_drawn_at_random() -> None:
-    alike = StudyCase("alike", 0.8)
-    assert alike.size_at(0.5) == pytest.approx(6.0)
-    assert alike.size_at(0.9) == pytest.approx(6.0 + 0.8 * np.log(9.0))
+    equal_boards = StudyCase("alike", 0.8)
+    assert equal_boards.size_at(0.5) == pytest.approx(6.0)
+    assert equal_boards.size_at(0.9) == pytest.approx(6.0 + 0.8 * np.log(9.0))
     random = np.random.default_rng(1)
     a50_mm = 6.0 + 2.0 * random.standard_normal(200_000)
     size_mm = StudyCase("differ", 0.8, shift_mm=2.0).size_at(0.9)
-    found = random.random(200_000) < 1.0 / (1.0 + np.exp((a50_mm - size_mm) / 0.8))
-    assert found.mean() == pytest.approx(0.9, abs=0.003)
+    hits = random.random(200_000) < 1.0 / (1.0 + np.exp((a50_mm - size_mm) / 0.8))
+    assert hits.mean() == pytest.approx(0.9, abs=0.003)
 
 
 @pytest.mark.parametrize("law", ["Gaussian", "Student 12"])
@@ -43,16 +43,16 @@ def test_scores_of_hole_free_boards_have_the_stated_law(law: str) -> None:
     assert case.rate_at(case.wanted_threshold) == pytest.approx(1.0)
     score = studies.LAWS[law].isf(1 / 2000 / 2)
     random = np.random.default_rng(2)
-    seen = []
+    sizes = []
 
     def kept(peaks: list[list[float]], *_: float) -> None:
-        seen.append(np.array(peaks))
+        sizes.append(np.array(peaks))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(studies, "threshold_from_peaks", kept)
         for _ in range(20):
             studies.drawn_threshold(case, random)
-    peaks = np.concatenate(seen)
+    peaks = np.concatenate(sizes)
     assert peaks.shape == (1200, 10)
     assert (np.diff(peaks, axis=1) < 0).all()
     # Poisson: standard error 0.03
@@ -146,8 +146,8 @@ def test_counted_false_calls_agree_where_the_intervals_overlap() -> None:
         calls[:number] = 1
         unflawed = replace(record.unflawed, calls=calls)
         limits.append(limit_of(replace(record, threshold_error=stated, unflawed=unflawed), draws=2))
-    given = limit_of(replace(limits[0].record, threshold_error=None), draws=2)
-    (row,) = boards._rates((*limits, given))
+    certain = limit_of(replace(limits[0].record, threshold_error=None), draws=2)
+    (row,) = boards._rates((*limits, certain))
     assert (row.held, row.stated) == (1, 2)
     assert row.ratio == pytest.approx(10 / 3.24)
 

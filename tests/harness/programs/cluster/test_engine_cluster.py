@@ -97,15 +97,15 @@ def engine_at(cluster: Processes, limits: Limits = NO_LIMITS) -> ClusterEngine:
 def test_results_are_those_of_this_process(cluster):
     jobs = [*squares(300), Job("bad", "trials", raises, (7,))]
     with SerialEngine() as serial:
-        here = run(serial, jobs)
+        local = run(serial, jobs)
     with engine_at(cluster) as engine:
-        there = run(engine, jobs)
+        remote = run(engine, jobs)
     assert {
-        name: (options.state, options.value, options.is_bug) for name, options in there.items()
-    } == {name: (options.state, options.value, options.is_bug) for name, options in here.items()}
-    assert "ValueError: no such number: 7" in there["bad"].why
-    assert {options.worker.partition(":")[0] for options in there.values()} == {"127.0.0.1"}
-    assert len({options.worker for options in there.values()}) == 2
+        name: (options.state, options.value, options.is_bug) for name, options in remote.items()
+    } == {name: (options.state, options.value, options.is_bug) for name, options in local.items()}
+    assert "ValueError: no such number: 7" in remote["bad"].why
+    assert {options.worker.partition(":")[0] for options in remote.values()} == {"127.0.0.1"}
+    assert len({options.worker for options in remote.values()}) == 2
 
 
 def test_the_queue_stays_short_whatever_the_plan(cluster):
@@ -219,13 +219,15 @@ def test_what_cannot_be_reached(scheduler, message, tmp_path):
 
 
 def test_a_worker_with_other_code_is_refused(tmp_path):
-    other = tmp_path / "other"
+    second_folder = tmp_path / "other"
     for room in ("harness", "scenes", "detectors"):
-        shutil.copytree(ROOT / room, other / room, ignore=shutil.ignore_patterns("__pycache__"))
-    with open(other / "detectors" / "averages" / "average.py", "a") as changed:
+        shutil.copytree(
+            ROOT / room, second_folder / room, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    with open(second_folder / "detectors" / "averages" / "average.py", "a") as changed:
         changed.write("\n# another version\n")
     with processes(tmp_path / "cluster") as old:
-        old.worker("--no-nanny", search=other)
+        old.worker("--no-nanny", search=second_folder)
         with pytest.raises(UserError, match="another version of tofpod"), engine_at(old):
             pass
 
@@ -344,18 +346,18 @@ def test_a_plan_gives_the_same_records_on_a_cluster(cluster, experiment, tiny_ou
     here_at = tmp_path / "journal here"
     there_at = tmp_path / "journal there"
     with engine_at(cluster) as engine:
-        there = run_plan(
+        remote = run_plan(
             plan_of(declared, tmp_path / "cache"), Journal(there_at), engine, lambda _: None
         )
-    here = run_serially(plan_of(declared, tmp_path / "cache"), here_at)
+    local = run_serially(plan_of(declared, tmp_path / "cache"), here_at)
     assert (
-        not there.failures
-        and there.renders.over == 2
-        and len(there.examples) == len(here.examples) == 2
+        not remote.failures
+        and remote.renders.over == 2
+        and len(remote.examples) == len(local.examples) == 2
     )
-    assert there.finished == here.finished and len(here.finished) == 4
-    assert without_seconds(records_of(here_at, here)) == without_seconds(
-        records_of(there_at, there)
+    assert remote.finished == local.finished and len(local.finished) == 4
+    assert without_seconds(records_of(here_at, local)) == without_seconds(
+        records_of(there_at, remote)
     )
 
 
@@ -363,11 +365,11 @@ def without_seconds(value: object) -> object:
     """What trials found, timings apart."""
     if isinstance(value, dict):
         return {
-            key: without_seconds(one)
-            for key, one in value.items()
+            key: without_seconds(element)
+            for key, element in value.items()
             if not str(key).startswith("seconds")
         }
-    return [without_seconds(one) for one in value] if isinstance(value, list) else value
+    return [without_seconds(element) for element in value] if isinstance(value, list) else value
 
 
 @pytest.mark.slow  # test_engine has Ctrl-C without a cluster

@@ -55,17 +55,19 @@ def inspections(
     size_mm = rng.uniform(0.5, 8, count)
     cosine = rng.uniform(0.4, 1, count)
     range_m = rng.uniform(0.6, 0.9, count)
-    seen = Seen(
+    visibility = Seen(
         deviation_m=rng.uniform(1e-3, 3e-3, count)[damage],
         cosine=cosine[damage],
         range_m=range_m[damage],
         residual_m=rng.normal(0.0, 1e-3, count)[damage],
     )
     size_mm = size_mm[damage]
-    noise = rng.standard_normal(len(damage)) * SCATTER / seen.cosine**growth
-    whole_m = signal_m(size_mm, seen) * np.exp(noise) + share * seen.residual_m
-    score = whole_m / seen.deviation_m
-    return ScoredDamage("depth", damage, size_mm, seen, np.where(score > THRESHOLD, score, np.nan))
+    noise = rng.standard_normal(len(damage)) * SCATTER / visibility.cosine**growth
+    whole_m = signal_m(size_mm, visibility) * np.exp(noise) + share * visibility.residual_m
+    score = whole_m / visibility.deviation_m
+    return ScoredDamage(
+        "depth", damage, size_mm, visibility, np.where(score > THRESHOLD, score, np.nan)
+    )
 
 
 def test_a_patch_has_the_size_whose_signal_is_needed() -> None:
@@ -79,10 +81,10 @@ def test_a_patch_has_the_size_whose_signal_is_needed() -> None:
         1, abs=0.25
     )
     unit_m = np.array([1e-3, 2e-3, 1e-3, 12e-3, np.inf, 1e-3])
-    places = Seen(unit_m, np.array([1, 1, 0.5, 0.5, 1, 0.3]), np.full(6, 0.7), np.zeros(6))
-    needed_m = THRESHOLD * unit_m * np.exp(1.2816 * SCATTER / places.cosine)
-    wanted = (needed_m / signal_m(np.ones(6), places)) ** (1 / 1.5)
-    limits_mm = result.limits_mm(places)
+    visibility = Seen(unit_m, np.array([1, 1, 0.5, 0.5, 1, 0.3]), np.full(6, 0.7), np.zeros(6))
+    needed_m = THRESHOLD * unit_m * np.exp(1.2816 * SCATTER / visibility.cosine)
+    wanted = (needed_m / signal_m(np.ones(6), visibility)) ** (1 / 1.5)
+    limits_mm = result.limits_mm(visibility)
     assert limits_mm[:3] == pytest.approx(wanted[:3], rel=0.03)
     assert (
         np.isinf(limits_mm[3]) and np.isnan(limits_mm[4:]).all()
@@ -97,10 +99,10 @@ def test_what_an_undamaged_place_shows_adds_to_damage_there(share: float) -> Non
     law = findable(inspections(1500, share=share), THRESHOLD)
     assert law.share == pytest.approx(share, abs=0.25)  # a step; 281 damages tell it within 0.15
     residual_m = np.array([0.0, 2e-3, -2e-3])
-    places = Seen(np.full(3, 2e-3), np.ones(3), np.full(3, 0.7), residual_m)
+    visibility = Seen(np.full(3, 2e-3), np.ones(3), np.full(3, 0.7), residual_m)
     needed_m = (THRESHOLD * 2e-3 - law.share * residual_m) * np.exp(1.2816 * SCATTER)
-    wanted = (needed_m / signal_m(np.ones(3), places)) ** (1 / 1.5)
-    assert law.limits_mm(places) == pytest.approx(wanted, rel=0.05)
+    wanted = (needed_m / signal_m(np.ones(3), visibility)) ** (1 / 1.5)
+    assert law.limits_mm(visibility) == pytest.approx(wanted, rel=0.05)
 
 
 def test_a_place_that_exceeds_the_threshold_undamaged_needs_little() -> None:
@@ -139,8 +141,8 @@ def test_too_few_damages_teach_nothing() -> None:
 def test_poses_are_taken_by_what_they_add() -> None:
     patches = Patches(np.zeros((5, 3)), np.zeros((5, 3)), np.array([1.0, 1.0, 2.0, 4.0, 2.0]))
     result = [
-        np.array(one, bool)
-        for one in ([1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 1, 0], [1, 1, 0, 0, 0])
+        np.array(pattern, bool)
+        for pattern in ([1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 1, 0], [1, 1, 0, 0, 0])
     ]
     # the others add nothing
     assert in_turn(patches, result, 1, 3) == [(0, 0.2, 0.2), (1, 0.6, 0.8)]
@@ -163,8 +165,8 @@ def test_the_program_says_where_the_camera_is_blind(
     )  # no other pose to suggest
     (tmp_path / ".cache").symlink_to(study_out / ".cache")  # holds most of the views
     tiny = str(study_out.parent / "tiny.yaml")
-    one = ["--set", "sweep={}", "--serial", "--results", str(tmp_path)]
-    assert main([tiny, *one, "--size", "8mm", "--suggest", "1"]) == 0
+    arguments = ["--set", "sweep={}", "--serial", "--results", str(tmp_path)]
+    assert main([tiny, *arguments, "--size", "8mm", "--suggest", "1"]) == 0
     printed = capsys.readouterr().out
     folder = tmp_path / "coverage" / "tiny"
     assert printed.startswith("warning: 0 of 1 pose suggested")  # warnings stand first

@@ -312,30 +312,30 @@ def test_patches_have_the_noise_of_their_pixels(monkeypatch: pytest.MonkeyPatch)
     """Pixels at each corner of the region and one beyond each side."""
     pixels = [(15, 10), (69, 10), (15, 49), (69, 49), (14, 30), (70, 30), (40, 9), (40, 50)]
     points = [on_wall(u, v) for u, v in pixels]
-    seen = seen_by(monkeypatch, points, len(pixels) * [FACING], 0.0)
+    visibility = seen_by(monkeypatch, points, len(pixels) * [FACING], 0.0)
     columns = REGION.shape[1]
     corners = [0, columns - 1, 39 * columns, 40 * columns - 1]
-    assert seen.deviation_m.tolist() == [*corners, np.inf, np.inf, np.inf, np.inf]
-    assert seen.residual_m.tolist() == [*(2 * corner for corner in corners), 0, 0, 0, 0]
+    assert visibility.deviation_m.tolist() == [*corners, np.inf, np.inf, np.inf, np.inf]
+    assert visibility.residual_m.tolist() == [*(2 * corner for corner in corners), 0, 0, 0, 0]
     ranges_m = np.linalg.norm(points, axis=1)
-    assert seen.range_m == pytest.approx(ranges_m)
-    assert seen.cosine == pytest.approx(-(np.array(points) @ FACING) / ranges_m)
+    assert visibility.range_m == pytest.approx(ranges_m)
+    assert visibility.cosine == pytest.approx(-(np.array(points) @ FACING) / ranges_m)
 
 
 def test_a_patch_behind_something_is_not_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a slope, two pixels along it: 2 tan(angle) x range / 100, here about 12 mm at the axis."""
-    at = on_wall(40, 30)
+    point = on_wall(40, 30)
     angle = np.arccos(np.cos(TILT_RAD))
     reach_m = 2 * np.tan(angle) * 1.0 / 100.0
-    points = [at, on_wall(40, 30, 0.99 * reach_m), on_wall(40, 30, 1.02 * reach_m)]
-    seen = seen_by(monkeypatch, points, 3 * [FACING], 0.0)
-    assert np.isfinite(seen.deviation_m).tolist() == [True, True, False]
+    points = [point, on_wall(40, 30, 0.99 * reach_m), on_wall(40, 30, 1.02 * reach_m)]
+    visibility = seen_by(monkeypatch, points, 3 * [FACING], 0.0)
+    assert np.isfinite(visibility.deviation_m).tolist() == [True, True, False]
     level = [0.0, 0.0, -1.0]
     points = [on_wall(40, 30, 4.9e-3), on_wall(40, 30, 5.1e-3), on_wall(40, 30, -5.1e-3)]
-    seen = seen_by(monkeypatch, points, 3 * [level], 0.0)
-    assert np.isfinite(seen.deviation_m).tolist() == [True, False, False]
-    seen = seen_by(monkeypatch, [on_wall(40, 39), on_wall(40, 40)], 2 * [FACING], 0.05)
-    assert np.isfinite(seen.deviation_m).tolist() == [True, False]
+    visibility = seen_by(monkeypatch, points, 3 * [level], 0.0)
+    assert np.isfinite(visibility.deviation_m).tolist() == [True, False, False]
+    visibility = seen_by(monkeypatch, [on_wall(40, 39), on_wall(40, 40)], 2 * [FACING], 0.05)
+    assert np.isfinite(visibility.deviation_m).tolist() == [True, False]
 
 
 def test_a_patch_that_faces_away_is_not_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -190,10 +190,10 @@ def test_no_unit_and_no_board_is_in_two_splits(home):
 def test_the_card_shows_its_command_as_text(home, monkeypatch):
     """The command may hold anything, and its page must not run it."""
     folder = home / "set"
-    about = json.loads((folder / "dataset.json").read_text())
-    about["provenance"]["command"] = "tofpod dataset '`<script>alert(1)</script>`'"
+    description = json.loads((folder / "dataset.json").read_text())
+    description["provenance"]["command"] = "tofpod dataset '`<script>alert(1)</script>`'"
     card = template("dataset_card.md", Path(dataset.__file__).parent)
-    text = card.render(about=about, inset=INSET_PX, title=camera_title)
+    text = card.render(about=description, inset=INSET_PX, title=camera_title)
     assert "<script>" not in text
     assert "<pre><code>tofpod dataset &#39;`&lt;script&gt;alert(1)" in text
 

@@ -30,9 +30,11 @@ def scored(dataset_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         target = blind / path.relative_to(maps)
         target.parent.mkdir(parents=True, exist_ok=True)
         np.save(target, rng.random(np.load(path).shape))
-    for name, given in (("thesis", maps), ("blind", str(blind))):
+    for name, maps_folder in (("thesis", maps), ("blind", str(blind))):
         out = str(home / name)
-        assert score.main([given, "--dataset", folder, "--name", name, "--out", out, *RATE]) == 0
+        assert (
+            score.main([maps_folder, "--dataset", folder, "--name", name, "--out", out, *RATE]) == 0
+        )
     return home
 
 

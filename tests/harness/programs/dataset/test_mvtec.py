@@ -59,10 +59,10 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 mask[disc] = 255
                 mask[31, 23] = 255  # touches the disc of 2 px at a corner
                 strength[disc] = 1.2 * (radius - 3.2) + rng.normal(0, 1.5)
-        place, _, number_text = name.rpartition("/")
-        written(home / "set" / place / "xyz" / f"{number_text}.tiff", points()[..., ::-1])
+        folder_name, _, number_text = name.rpartition("/")
+        written(home / "set" / folder_name / "xyz" / f"{number_text}.tiff", points()[..., ::-1])
         if "validation" not in name:
-            written(home / "set" / place / "gt" / f"{number_text}.png", mask)
+            written(home / "set" / folder_name / "gt" / f"{number_text}.png", mask)
         noise = np.round(rng.normal(0, 1, mask.shape) + strength, 1)
         written(home / "maps" / f"{name}.tiff", noise.astype(np.float32))
     return home
@@ -73,8 +73,10 @@ def map_of(home: Path, name: str) -> np.ndarray:
 
 
 def mask_of(home: Path, name: str) -> np.ndarray:
-    place, _, number = name.rpartition("/")
-    return cv2.imread(str(home / "set" / place / "gt" / f"{number}.png"), cv2.IMREAD_UNCHANGED)
+    folder_name, _, number = name.rpartition("/")
+    return cv2.imread(
+        str(home / "set" / folder_name / "gt" / f"{number}.png"), cv2.IMREAD_UNCHANGED
+    )
 
 
 def judged_names(home: Path) -> list[str]:
@@ -134,11 +136,11 @@ def test_sizes_are_those_of_circles_by_the_spacing_of_points(home: Path):
     _, damages = data.damages("cookie/test/crack/000")
     mask = mask_of(home, "cookie/test/crack/000")
     expected_mm = 1000 * np.sqrt(4 * (mask[:, :40] > 0).sum() * ACROSS_M * DOWN_M / np.pi)
-    left = min(damages, key=lambda damage: damage["x_board_mm"])
-    assert left["diameter_mm"] == pytest.approx(expected_mm, rel=1e-3)
+    leftmost = min(damages, key=lambda damage: damage["x_board_mm"])
+    assert leftmost["diameter_mm"] == pytest.approx(expected_mm, rel=1e-3)
     rows, columns = np.nonzero(mask[:, :40])
     centre_m = [columns.mean() * ACROSS_M, rows.mean() * DOWN_M]
-    assert left["line_m"][0] == pytest.approx(centre_m, rel=1e-3)
+    assert leftmost["line_m"][0] == pytest.approx(centre_m, rel=1e-3)
     assert len(damages) == 2
 
 

@@ -43,12 +43,17 @@ def test_detectors_stand_beside_the_ideal_observer(
     tables = [pd.read_parquet(results / table.files[1]) for table in EFFICIENCY_TABLES]
     efficiency, damages = tables
     assert efficiency["frames"].tolist() == [1, 2] and len(damages) == 2 * 4 * 5
-    one = damages[damages["set_up"].str.startswith("1 frame")]
+    single_frame = damages[damages["set_up"].str.startswith("1 frame")]
     two = damages[damages["set_up"].str.startswith("2 frames")]
     # more frames, more signal; damage that shows nothing has none
-    assert (two["index"].to_numpy() >= one["index"].to_numpy()).mean() > 0.9
-    assert np.corrcoef(np.log(one["diameter_mm"]), np.log(one["index"]))[0, 1] > 0.8
-    assert one["threshold"].between(3.5, 5.0).all() and one["pod"].between(0, 1).all()
+    assert (two["index"].to_numpy() >= single_frame["index"].to_numpy()).mean() > 0.9
+    assert (
+        np.corrcoef(np.log(single_frame["diameter_mm"]), np.log(single_frame["index"]))[0, 1] > 0.8
+    )
+    assert (
+        single_frame["threshold"].between(3.5, 5.0).all()
+        and single_frame["pod"].between(0, 1).all()
+    )
     # the ideal observer needs smaller damage than the detector, and none is better than it
     reference = efficiency.dropna(subset="efficiency_50_share")
     assert (reference["ideal_a50_mm"] < reference["a50_mm"]).all() and (

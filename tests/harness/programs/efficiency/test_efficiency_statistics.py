@@ -65,9 +65,9 @@ def test_kurtosis_and_sums_of_sums_by_hand() -> None:
 def test_products_of_pairs_by_brute_force() -> None:
     rng = np.random.default_rng(1)
     noise = rng.standard_normal((2, 7, 9))
-    known = rng.random(noise.shape) < 0.7
-    sums = noise_sums(noise, known)
-    filled = np.where(known, noise, 0.0)
+    is_known = rng.random(noise.shape) < 0.7
+    sums = noise_sums(noise, is_known)
+    filled = np.where(is_known, noise, 0.0)
     for row, column in ((0, 0), (1, 0), (0, 3), (2, -4), (-6, 8)):
         product = pairs = 0.0
         for field in range(2):
@@ -75,12 +75,14 @@ def test_products_of_pairs_by_brute_force() -> None:
                 for u in range(9):
                     if 0 <= v + row < 7 and 0 <= u + column < 9:
                         product += filled[field, v, u] * filled[field, v + row, u + column]
-                        pairs += float(known[field, v, u] and known[field, v + row, u + column])
+                        pairs += float(
+                            is_known[field, v, u] and is_known[field, v + row, u + column]
+                        )
         assert sums.products[MIDDLE + row, MIDDLE + column] == pytest.approx(product, abs=1e-9)
         assert sums.pairs[MIDDLE + row, MIDDLE + column] == pytest.approx(pairs, abs=1e-9)
     assert sums.products[MIDDLE + 7, MIDDLE] == pytest.approx(0.0, abs=1e-9)
-    assert sums.fourth == pytest.approx((noise[known] ** 4).sum())
-    assert sums.pixels == known.sum()
+    assert sums.fourth == pytest.approx((noise[is_known] ** 4).sum())
+    assert sums.pixels == is_known.sum()
 
 
 def test_the_deviation_is_that_of_units_around_each_pixel() -> None:
@@ -88,10 +90,10 @@ def test_the_deviation_is_that_of_units_around_each_pixel() -> None:
     noise = np.full((4, 200, 400), 2.0)
     noise[:, :, 200:] = 3.0
     noise[::2] *= -1
-    known = np.ones(noise.shape, bool)
-    known[:, :, :50] = False
-    known[:2, :100] = False
-    deviation = ideal_trials._deviation_m(np.where(known, noise, 0.0), known)
+    is_known = np.ones(noise.shape, bool)
+    is_known[:, :, :50] = False
+    is_known[:2, :100] = False
+    deviation = ideal_trials._deviation_m(np.where(is_known, noise, 0.0), is_known)
     assert deviation[:, 60:165] == pytest.approx(2.0)
     assert deviation[:, :20] == pytest.approx(2.0)
     assert deviation[:, 235:] == pytest.approx(3.0)
@@ -117,10 +119,10 @@ def test_half_a_hit_or_half_a_miss_is_no_curve() -> None:
     x = np.array([1.0, 2.0, 3.0, 4.0])
     weights = np.ones((1, 4))
     for total, has_curve in ((0.48, False), (0.52, True)):
-        few = total * np.array([0.0, 0.1, 0.3, 0.6])
-        assert np.isfinite(expected_sizes(x, few, weights)[0, 0]) == has_curve
-        most = 1 - few[::-1]
-        smallest = expected_sizes(x, most, weights)[:, 0]
+        fewest = total * np.array([0.0, 0.1, 0.3, 0.6])
+        assert np.isfinite(expected_sizes(x, fewest, weights)[0, 0]) == has_curve
+        largest = 1 - fewest[::-1]
+        smallest = expected_sizes(x, largest, weights)[:, 0]
         assert (smallest.tolist() == [1.0, 1.0]) == (not has_curve)
 
 

@@ -34,7 +34,7 @@ def study() -> StudyRecord:
     )
     record = study_record(Study(set_ups, boards=40, hole_free_boards=12))
     thresholds = {"median": 4.0, "none": 5.0, "spatial": 6.0, "alone": 5.0}
-    changed = [replace(each, threshold=thresholds[each.variant]) for each in record.set_ups]
+    changed = [replace(set_up, threshold=thresholds[set_up.variant]) for set_up in record.set_ups]
     return replace(record, set_ups=tuple(changed))
 
 
@@ -55,8 +55,8 @@ def costs(study: StudyRecord) -> dict[str, FilterCost]:
         holes.append(rows.assign(variant=set_up.variant, frames=1))
         quiet = {"median": [4.5, 5.5, 3.0], "none": [4.9, 4.0, 5.5]}.get(set_up.variant, [9.0] * 3)
         quiet_runs = pd.DataFrame({"role": "hole_free", "quiet_threshold": quiet})
-        other = pd.DataFrame({"role": "calibration", "quiet_threshold": [99.0]})
-        runs.append(pd.concat([quiet_runs, other]).assign(variant=set_up.variant, frames=1))
+        calibration = pd.DataFrame({"role": "calibration", "quiet_threshold": [99.0]})
+        runs.append(pd.concat([quiet_runs, calibration]).assign(variant=set_up.variant, frames=1))
     limits = [limit_of(set_up) for set_up in study.set_ups]
     listed = costs_of(limits, pd.concat(holes), pd.concat(runs))
     assert [cost.limit.record.variant for cost in listed] == ["none", "median", "spatial"]

@@ -123,13 +123,13 @@ def test_a_baseline_that_cannot_be_read_is_written_anew_by_update_alone(
 
 
 def test_the_first_line_says_that_the_baseline_is_older_and_since_what(program, experiment, capsys):
-    found = record()
+    stored = record()
     now = experiment_digests(experiment)
 
     def first_line(digests: object) -> str:
-        provenance = {**found.provenance, "versions": {"tofpod": "0.1.0"}, "digests": digests}
-        write_text(program.baseline, record_text(replace(found, provenance=provenance)))
-        assert program(found) == 0
+        provenance = {**stored.provenance, "versions": {"tofpod": "0.1.0"}, "digests": digests}
+        write_text(program.baseline, record_text(replace(stored, provenance=provenance)))
+        assert program(stored) == 0
         return capsys.readouterr().out.partition("\n")[0]
 
     older = f"{program.baseline} is older than the code (tofpod 0.1.0): "
@@ -165,15 +165,15 @@ def test_exit_codes(program, capsys):
 
 
 def test_failed_trials_and_missing_set_ups_fail(program, capsys):
-    one = record()
+    before = record()
     assert program(record(SetUp(), SetUp(frames=5)), "--update") == 0
     assert program(record(SetUp(), SetUp(frames=5), SetUp(frames=9))) == 0, (
         "a further one is no fault"
     )
-    assert program(one) == 1
+    assert program(before) == 1
     assert "missing, although in the baseline: 5 frames" in capsys.readouterr().err
     broken = replace(
-        one, set_ups=(replace(one.set_ups[0], failed=1), *record(SetUp(frames=5)).set_ups)
+        before, set_ups=(replace(before.set_ups[0], failed=1), *record(SetUp(frames=5)).set_ups)
     )
     assert program(broken, code=1) == 1
     assert "1 trials failed, 0 before" in capsys.readouterr().out

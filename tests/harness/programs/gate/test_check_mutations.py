@@ -69,8 +69,8 @@ class Gate:
             "--serial",
             *(["--update"] if update else []),
         ]
-        for one in (*SMALLER, *changed):
-            arguments += ["--set", one]
+        for mutation in (*SMALLER, *changed):
+            arguments += ["--set", mutation]
         with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as errors:
             code = check.main(arguments)
         lines = out.getvalue().splitlines()

@@ -99,8 +99,10 @@ def test_sign_flip_is_the_enumeration_of_all_signs(gained):
     ]
     observed = sum(gained)
     fewer, additional = sign_flip(np.array(gained))
-    assert fewer == pytest.approx(np.mean([one <= observed for one in sums]), abs=1e-12)
-    assert additional == pytest.approx(np.mean([one >= observed for one in sums]), abs=1e-12)
+    assert fewer == pytest.approx(np.mean([possible <= observed for possible in sums]), abs=1e-12)
+    assert additional == pytest.approx(
+        np.mean([possible >= observed for possible in sums]), abs=1e-12
+    )
 
 
 def test_sign_flip_by_hand():
@@ -147,8 +149,8 @@ def test_only_shared_inspections_are_compared_in_any_order():
     part = Inspected(
         *(column[order] for column in vars(complete).values() if isinstance(column, np.ndarray))
     )
-    one, two = shared_rows(complete, part)
-    assert [(complete.hole[a], part.hole[b]) for a, b in zip(one, two, strict=True)] == [
+    rows, two = shared_rows(complete, part)
+    assert [(complete.hole[a], part.hole[b]) for a, b in zip(rows, two, strict=True)] == [
         ("0",) * 2,
         ("2",) * 2,
         ("3",) * 2,
@@ -303,8 +305,12 @@ def test_calibration_draws_are_in_the_false_calls_test_and_not_in_that_of_counts
         change = calls_change(*pair, 1.0)
         assert change is not None
         decided += change.more_p < 0.05
-        both = change.calls[1], max(sum(change.calls), 1), change.areas_m2[1] / sum(change.areas_m2)
-        counted += stats.binomtest(*both).pvalue / 2 < 0.05 and change.ratio > 1
+        counts = (
+            change.calls[1],
+            max(sum(change.calls), 1),
+            change.areas_m2[1] / sum(change.areas_m2),
+        )
+        counted += stats.binomtest(*counts).pvalue / 2 < 0.05 and change.ratio > 1
     assert 40 < decided <= stats.binom.ppf(1 - 1e-4, 2000, 0.05)
     assert counted > 300
 
@@ -351,13 +357,13 @@ def test_another_measuring_stick_is_not_compared(study, set_up, word):
 
 
 def test_another_family_of_damage_is_not_compared_and_other_boards_of_the_same_are():
-    one = small()
+    first = small()
     same = small(seed=2)
     larger = small(seed=2, sizes_mm=(12.0, 20.0))
-    assert not_comparable(one, same, one.set_ups[0], same.set_ups[0]) == ""
-    assert "sizes" in not_comparable(one, larger, one.set_ups[0], larger.set_ups[0])
+    assert not_comparable(first, same, first.set_ups[0], same.set_ups[0]) == ""
+    assert "sizes" in not_comparable(first, larger, first.set_ups[0], larger.set_ups[0])
     deeper = replace(same.set_ups[0].inspected, depth_mm=same.set_ups[0].inspected.depth_mm + 3)
-    assert "depths" in only_row(one, first_set_up(same, inspected=deeper)).why
+    assert "depths" in only_row(first, first_set_up(same, inspected=deeper)).why
 
 
 # --- verdicts
@@ -377,35 +383,37 @@ def test_a_study_is_as_good_as_itself():
 def test_worse_one_way_is_better_the_other():
     first = small(SetUp(a50_mm=5))
     second = small(SetUp(a50_mm=7, detector_version=2, frames_digest="b"))
-    there = only_row(first, second)
+    row = only_row(first, second)
     back = only_row(second, first)
-    assert (there.mark, back.mark) == ("worse", "better")
-    assert there.limit.ratio == pytest.approx(1 / back.limit.ratio)
-    assert (there.hits.only_first, there.hits.only_second) == (
+    assert (row.mark, back.mark) == ("worse", "better")
+    assert row.limit.ratio == pytest.approx(1 / back.limit.ratio)
+    assert (row.hits.only_first, row.hits.only_second) == (
         back.hits.only_second,
         back.hits.only_first,
     )
-    assert there.hits.fewer_p == pytest.approx(back.hits.more_p)
-    assert there.changed == ("plane 1 → plane 2", "other frames of the same boards")
-    assert there.is_worse and not back.is_worse
+    assert row.hits.fewer_p == pytest.approx(back.hits.more_p)
+    assert row.changed == ("plane 1 → plane 2", "other frames of the same boards")
+    assert row.is_worse and not back.is_worse
 
 
 def test_a_larger_limit_that_may_be_chance_is_not_worse():
     """Of one board alone all hits are lost: the limit grows, and one board is no evidence."""
-    one = small(boards=3, holes=16)
-    inspected = one.set_ups[0].inspected
+    first = small(boards=3, holes=16)
+    inspected = first.set_ups[0].inspected
     row = only_row(
-        one,
-        first_set_up(one, inspected=replace(inspected, hit=inspected.hit & (inspected.board != 0))),
+        first,
+        first_set_up(
+            first, inspected=replace(inspected, hit=inspected.hit & (inspected.board != 0))
+        ),
     )
     assert row.limit.ratio > 1.1 and row.hits.only_first > row.hits.only_second
     assert row.hits.fewer_p == pytest.approx(0.5) and row.mark == "not significant"
 
 
 def test_the_test_of_hits_answers_for_the_limit():
-    one = small(SetUp(a50_mm=5))
-    lost = only_row(one, small(SetUp(a50_mm=8)))
-    equal = only_row(one, small(SetUp(a50_mm=5)))
+    first = small(SetUp(a50_mm=5))
+    lost = only_row(first, small(SetUp(a50_mm=8)))
+    equal = only_row(first, small(SetUp(a50_mm=5)))
     assert lost.mark == "worse"
     # of Holm's three questions the smaller of two equal p, and of two tests of the limit the
     # stronger
@@ -414,8 +422,8 @@ def test_the_test_of_hits_answers_for_the_limit():
 
 
 def test_a_significant_loss_within_the_margin_is_as_good():
-    one = study_record(Study((SetUp(a50_mm=8.0, own_noise=0.0),), boards=120))
-    row = only_row(one, study_record(Study((SetUp(a50_mm=8.5, own_noise=0.0),), boards=120)))
+    first = study_record(Study((SetUp(a50_mm=8.0, own_noise=0.0),), boards=120))
+    row = only_row(first, study_record(Study((SetUp(a50_mm=8.5, own_noise=0.0),), boards=120)))
     assert row.limit_p[0] < ALPHA and 1.0 < row.limit.ratio < 1.1 and row.mark == "as good"
 
 
@@ -540,31 +548,35 @@ def test_more_false_calls_are_worse_whatever_the_limit():
 
 
 def test_lost_limits_and_failed_trials_fail_and_the_way_back_is_newly_working():
-    one = small()
-    inspected = one.set_ups[0].inspected
-    blind = first_set_up(one, inspected=replace(inspected, hit=np.zeros(len(inspected.hit), bool)))
-    assert (only_row(one, blind).mark, only_row(blind, one).mark) == (
+    first = small()
+    inspected = first.set_ups[0].inspected
+    blind = first_set_up(
+        first, inspected=replace(inspected, hit=np.zeros(len(inspected.hit), bool))
+    )
+    assert (only_row(first, blind).mark, only_row(blind, first).mark) == (
         "newly failing",
         "newly working",
     )
     assert only_row(blind, blind).mark == "no limit"
-    broken = only_row(one, first_set_up(one, failed=2))
+    broken = only_row(first, first_set_up(first, failed=2))
     assert broken.mark == "newly failing" and broken.why == "2 trials failed, 0 before"
-    assert only_row(first_set_up(one, failed=2), one).mark == "as good"
+    assert only_row(first_set_up(first, failed=2), first).mark == "as good"
 
 
 def test_everything_found_is_no_failure():
-    one = small()
-    inspected = one.set_ups[0].inspected
-    perfect = first_set_up(one, inspected=replace(inspected, hit=np.ones(len(inspected.hit), bool)))
-    assert only_row(one, perfect).mark == "better"
-    assert only_row(perfect, one).mark == "worse"
+    first = small()
+    inspected = first.set_ups[0].inspected
+    perfect = first_set_up(
+        first, inspected=replace(inspected, hit=np.ones(len(inspected.hit), bool))
+    )
+    assert only_row(first, perfect).mark == "better"
+    assert only_row(perfect, first).mark == "worse"
 
 
 def test_other_boards_are_compared_by_their_limits():
-    one = small(SetUp(a50_mm=5))
-    same = only_row(one, small(SetUp(a50_mm=5), seed=3))
-    worse = only_row(one, small(SetUp(a50_mm=8), seed=3))
+    first = small(SetUp(a50_mm=5))
+    same = only_row(first, small(SetUp(a50_mm=5), seed=3))
+    worse = only_row(first, small(SetUp(a50_mm=8), seed=3))
     assert same.hits is None and worse.hits is None and not worse.limit.paired
     assert (same.mark, worse.mark) == ("as good", "worse") and worse.changed == ("other boards",)
 
@@ -576,19 +588,19 @@ def test_holm_by_hand():
 
 def test_many_set_ups_ask_for_more():
     """A loss that convicts a single set-up does not convict one of forty."""
-    one = small(boards=14, hole_free_boards=4)
+    first = small(boards=14, hole_free_boards=4)
     observed = replace(
-        one.set_ups[0].inspected, signal=np.full(len(one.set_ups[0].inspected.hit), np.nan)
+        first.set_ups[0].inspected, signal=np.full(len(first.set_ups[0].inspected.hit), np.nan)
     )
-    one = first_set_up(one, inspected=observed)  # of hits alone
+    first = first_set_up(first, inspected=observed)  # of hits alone
     worse = first_set_up(
-        one, inspected=replace(observed, hit=observed.hit & (observed.diameter_mm > 10))
+        first, inspected=replace(observed, hit=observed.hit & (observed.diameter_mm > 10))
     )
-    alone = only_row(one, worse)
+    alone = only_row(first, worse)
     assert alone.mark == "worse" and min(alone.hits.fewer_p, alone.limit.grown_p) > ALPHA / 160
-    remaining = tuple(replace(one.set_ups[0], variant=str(k)) for k in range(39))
+    remaining = tuple(replace(first.set_ups[0], variant=str(k)) for k in range(39))
     among = compare_studies(
-        *(replace(study, set_ups=study.set_ups + remaining) for study in (one, worse))
+        *(replace(study, set_ups=study.set_ups + remaining) for study in (first, worse))
     )
     assert (
         among.rows[0].mark == "not significant" and among.rows[0].limit.ratio == alone.limit.ratio

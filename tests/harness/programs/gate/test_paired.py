@@ -309,9 +309,9 @@ def unflawed(calls: list[int] | np.ndarray, **changes: Any) -> SetUpRecord:
 
 def beta_binomial(boards: int, rank: tuple[int, int]) -> np.ndarray:
     """Chances of 0 to ``boards`` calling boards, if the rate is drawn by the calibration."""
-    called = np.arange(boards + 1)
-    logs = special.betaln(called + rank[0], boards - called + rank[1]) - special.betaln(*rank)
-    return special.comb(boards, called) * np.exp(logs)
+    calls = np.arange(boards + 1)
+    logs = special.betaln(calls + rank[0], boards - calls + rank[1]) - special.betaln(*rank)
+    return special.comb(boards, calls) * np.exp(logs)
 
 
 def test_false_calls_are_compared_under_both_calibrations() -> None:
@@ -354,8 +354,8 @@ def test_signs_are_those_of_the_shared_boards_sums_over_repeats() -> None:
     board = np.array([7, 3, 7, 3, 5, 5])
     repeat = np.array([1, 1, 2, 2, 1, 2])
     first = Unflawed(board, repeat, np.array([1, 0, 1, 1, 0, 1]), np.full(6, AREA_M2))
-    other = np.where(board == 5, 9, board)
-    second = Unflawed(other, repeat, np.array([0, 2, 1, 1, 3, 0]), np.full(6, 2 * AREA_M2))
+    renamed = np.where(board == 5, 9, board)
+    second = Unflawed(renamed, repeat, np.array([0, 2, 1, 1, 3, 0]), np.full(6, 2 * AREA_M2))
     change = calls_change(unflawed([], unflawed=first), unflawed([], unflawed=second), None)
     assert change is not None
     assert change.way == "signs"
@@ -377,13 +377,13 @@ def test_on_equal_frames_with_other_thresholds_the_larger_p_value_counts() -> No
     calls = np.arange(16)
     first = unflawed(calls < 5, calibration_runs=20)
     second = unflawed(calls < 9, calibration_runs=20, threshold=1.01 * first.threshold)
-    both = calls_change(first, second, 2.0)
+    change = calls_change(first, second, 2.0)
     signs = calls_change(first, replace(second, threshold=first.threshold), 2.0)
     draws = calls_change(first, replace(second, frames_digest="b"), 2.0)
-    assert both is not None and signs is not None and draws is not None
-    assert (both.way, signs.way, draws.way) == ("both", "signs", "calibrations")
-    assert both.more_p == max(signs.more_p, draws.more_p) == draws.more_p > signs.more_p
-    assert both.fewer_p == max(signs.fewer_p, draws.fewer_p)
+    assert change is not None and signs is not None and draws is not None
+    assert (change.way, signs.way, draws.way) == ("both", "signs", "calibrations")
+    assert change.more_p == max(signs.more_p, draws.more_p) == draws.more_p > signs.more_p
+    assert change.fewer_p == max(signs.fewer_p, draws.fewer_p)
 
 
 def test_the_ratio_of_rates_without_calls() -> None:

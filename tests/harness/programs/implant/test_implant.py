@@ -78,8 +78,8 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
         **damage,
     )
     units = []
-    for each in (target, target.hole_free()):
-        view, _ = cached_view(each, camera.optics, RenderConfig(), tmp_path)
+    for variant in (target, target.hole_free()):
+        view, _ = cached_view(variant, camera.optics, RenderConfig(), tmp_path)
         units.append(SimulatedUnit(camera, NOISE, view))
     stacks = []
     for unit, name in zip(units, "ab", strict=True):
@@ -233,15 +233,15 @@ def test_the_program_states_a_limit_of_a_recording(
         == 0
     )
     record = read_record(out)
-    assert [one.frames for one in record.set_ups] == [1, FRAMES]
-    for one in record.set_ups:
-        inspected = one.inspected
+    assert [set_up.frames for set_up in record.set_ups] == [1, FRAMES]
+    for set_up in record.set_ups:
+        inspected = set_up.inspected
         assert len(inspected.hit) >= 4
         assert (
             inspected.hit[inspected.diameter_mm > 9].all()
             and not inspected.hit[inspected.diameter_mm < 2.5].any()
         )
-        assert one.unflawed.area_m2[0] == pytest.approx(80 * 110 * (0.6 / 504) ** 2, rel=0.05)
+        assert set_up.unflawed.area_m2[0] == pytest.approx(80 * 110 * (0.6 / 504) ** 2, rel=0.05)
     assert len(record.set_ups[0].unflawed.board) == FRAMES // 2
     printed = capsys.readouterr().out
     page = (out / "report.html").read_text()
@@ -295,7 +295,7 @@ def test_the_implanted_limit_is_the_simulated_one(tmp_path: Path):
     ]
     study += ["study.boards=7", "study.hole_free_boards=1"]
     study += ["source.target.damage={kind: through, per_board: 8, diameter_mm: [2, 8]}"]
-    arguments = [text for each in study for text in ("--set", each)]
+    arguments = [text for change in study for text in ("--set", change)]
     assert sweep.main([str(experiment), *changes, *arguments, "--out", str(tmp_path / "sim")]) == 0
     arguments = [
         "--camera",

@@ -53,9 +53,9 @@ def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scan:
     (tmp_path / "lens.json").write_text('{"fx": 200, "fy": 210, "cx": 39.5, "cy": 29.5}')
     judging = Judging("fake", "{}", RADIUS_M, None, lambda cloud: (6.5, ()))
     recording = opened([tmp_path / "part.npy"], str(tmp_path / "lens.json"), unit="m")
-    made = Scan(recording, judging)
+    scan = Scan(recording, judging)
     assert thresholds == [6.5]
-    return made
+    return scan
 
 
 def test_the_frame_of_a_scan_is_that_of_its_plane(scan: Scan) -> None:
@@ -77,11 +77,11 @@ def test_the_frame_of_a_scan_is_that_of_its_plane(scan: Scan) -> None:
 
 def test_places_lie_on_the_rays_of_their_pixels(scan: Scan) -> None:
     T = scan.T_camera_board
-    places = scan.places_m
+    positions = scan.places_m
     judged = np.zeros((60, 80), bool)
     judged[ROWS, COLUMNS] = True
-    assert np.array_equal(np.isfinite(places[..., 0]), judged)
-    points = places[judged] @ T[:3, :2].T + T[:3, 3]
+    assert np.array_equal(np.isfinite(positions[..., 0]), judged)
+    points = positions[judged] @ T[:3, :2].T + T[:3, 3]
     assert points == pytest.approx(wall_m()[judged], abs=1e-9)
     # between the edges of the outermost pixels that have neighbours on all sides: of the others no
     # area is known; edges are straight on a plane
@@ -99,8 +99,8 @@ def test_the_part_is_larger_than_what_is_judged_of_it(scan: Scan) -> None:
     """The wall fills the picture, of which 50 x 60 of 60 x 80 pixels are judged."""
     corners = np.array([(0, 0), (0, 79), (59, 0), (59, 79)])
     wall = wall_m()[tuple(corners.T)]
-    places = (wall - scan.T_camera_board[:3, 3]) @ scan.T_camera_board[:3, :2]
-    widths = places[[1, 3], 0] - places[[0, 2], 0]
+    positions = (wall - scan.T_camera_board[:3, 3]) @ scan.T_camera_board[:3, :2]
+    widths = positions[[1, 3], 0] - positions[[0, 2], 0]
     extent = scan.part.high_m - scan.part.low_m
     assert widths.min() * 0.95 < extent[0] < widths.max()
     assert extent[0] > 1.2 * scan.size_m[0]

@@ -39,10 +39,10 @@ def pose() -> np.ndarray:
 
 def in_camera(places_mm: Any, behind_m: float = 0.0) -> np.ndarray:
     """Points of the board's face, moved along their lines of sight."""
-    places = np.atleast_2d(np.array(places_mm, float)) * MM
-    points = np.column_stack([places, np.zeros(len(places))])
-    seen = points @ pose()[:3, :3].T + pose()[:3, 3]
-    return seen * (1 + behind_m / np.linalg.norm(seen, axis=1, keepdims=True))
+    positions = np.atleast_2d(np.array(places_mm, float)) * MM
+    points = np.column_stack([positions, np.zeros(len(positions))])
+    camera_points = points @ pose()[:3, :3].T + pose()[:3, 3]
+    return camera_points * (1 + behind_m / np.linalg.norm(camera_points, axis=1, keepdims=True))
 
 
 def judged_with(
@@ -50,14 +50,14 @@ def judged_with(
 ) -> Any:
     """Findings behind the face, on a face that is judged everywhere but where ``blind`` says."""
     x_mm, y_mm = np.meshgrid(np.arange(-110.0, 111.0, 2.0), np.arange(-90.0, 91.0, 2.0))
-    places = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
-    points = in_camera(places).reshape(*x_mm.shape, 3)
+    positions = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
+    points = in_camera(positions).reshape(*x_mm.shape, 3)
     score = np.zeros(x_mm.shape)
     if blind is not None:
         score[blind(x_mm, y_mm)] = np.nan
     detections = [
-        SimpleNamespace(centre_m=in_camera(place, behind_m)[0], score=6.0 + number)
-        for number, place in enumerate(findings_mm)
+        SimpleNamespace(centre_m=in_camera(position, behind_m)[0], score=6.0 + number)
+        for number, position in enumerate(findings_mm)
     ]
     cloud = SimpleNamespace(points_m=points)
     return SimpleNamespace(
@@ -112,5 +112,5 @@ def test_a_hole_must_be_judged_on_all_sides() -> None:
 
 def test_the_answer_counts_holes_and_calls() -> None:
     rows, calls = matched(judged_with([(0.0, 0.0), (20.0, 50.0)]))
-    seen = GaugeSeen(tuple(rows), calls, (), ())
-    assert seen.answer == "gauge: 1 hits, 3 misses, 0 holes not judged, 1 false call"
+    reading = GaugeSeen(tuple(rows), calls, (), ())
+    assert reading.answer == "gauge: 1 hits, 3 misses, 0 holes not judged, 1 false call"

@@ -113,12 +113,12 @@ def test_the_prior_is_students_without_steep_rises() -> None:
     transfer = campaign(np.array([5.0]), np.array([True]), uncertain(False))
     grid = transfer.grid
     spacing = np.array([2 * grid[-1, 0] / 240, 2 * grid[-1, 1] / 60])
-    own = transfer.own_covariance + np.diag(spacing**2 / 12)
-    assert transfer.own_spread == pytest.approx(own)
+    own_covariance = transfer.own_covariance + np.diag(spacing**2 / 12)
+    assert transfer.own_spread == pytest.approx(own_covariance)
     inverse = np.linalg.inv(transfer.scale)
     square = np.einsum("gi,ij,gj->g", grid, inverse, grid)
     student = -(3 + 2) / 2 * np.log1p(square / 3)
-    steep = special.log_ndtr(grid[:, 1] / np.sqrt(own[1, 1]))
+    steep = special.log_ndtr(grid[:, 1] / np.sqrt(own_covariance[1, 1]))
     difference = transfer.log_prior - (student + steep)
     assert np.ptp(difference) < 1e-9
 

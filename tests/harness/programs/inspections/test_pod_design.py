@@ -151,9 +151,9 @@ def test_the_fewest_targets_that_show_the_goal_are_recommended() -> None:
     assert recommend(plans, 6.9) == (plans[3], True)
     assert recommend(plans, 6.0) == (plans[0], True)
     assert recommend(plans, 5.9) == (plans[0], False)
-    few = [a_plan(20, 6.0), a_plan(30, 7.0)]
-    assert recommend(few) == (few[1], None)
-    assert recommend(few, 6.0) == (few[1], False)
+    too_few = [a_plan(20, 6.0), a_plan(30, 7.0)]
+    assert recommend(too_few) == (too_few[1], None)
+    assert recommend(too_few, 6.0) == (too_few[1], False)
 
 
 def test_hole_free_boards_by_hand() -> None:

@@ -74,8 +74,8 @@ def test_resampled_frames_are_those_of_the_other_image() -> None:
         normal = T[:3, 2]
         return (normal @ T[:3, 3]) / (rays @ normal)
 
-    whole = camera.nominal_lens.whole
-    slopes = camera.nominal_lens.region_slopes(whole)
+    region = camera.nominal_lens.whole
+    slopes = camera.nominal_lens.region_slopes(region)
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     z_m = board_z_m(T_depth_board, rays)
     frames = image.resampled(np.stack([z_m, z_m + 0.01]), camera)
@@ -92,20 +92,23 @@ def test_the_image_is_the_cameras_own_or_that_of_its_colour_camera() -> None:
     camera = load_camera("azure_kinect_nfov_binned")
     T_depth_board = pose(0.6)
     target = target_of((0.0, 0.0), T_camera_board=T_depth_board)
-    own = camera.nominal_lens
-    for lens, used in ((None, own), (Lens(own.width, own.height, 9.0, 9.0, 3.0, 3.0), None)):
+    nominal = camera.nominal_lens
+    for lens, used in (
+        (None, nominal),
+        (Lens(nominal.width, nominal.height, 9.0, 9.0, 3.0, 3.0), None),
+    ):
         image = image_of(target, camera, lens)
         assert image.lens == (used or lens)
         assert np.array_equal(image.T_image_board, T_depth_board)
         assert np.array_equal(image.T_image_depth, np.eye(4))
-    other = Lens(own.width, own.height + 1, 9.0, 9.0, 3.0, 3.0)
-    aligned = image_of(target, camera, other)
+    taller = Lens(nominal.width, nominal.height + 1, 9.0, 9.0, 3.0, 3.0)
+    aligned = image_of(target, camera, taller)
     assert aligned.lens.distortion == tuple(camera.colour.distortion.value)
     assert np.array_equal(aligned.T_image_depth, camera.colour.T_colour_depth)
     assert aligned.T_image_board == pytest.approx(camera.colour.T_colour_depth @ T_depth_board)
     distorted = Lens(9, 9, 9.0, 9.0, 3.0, 3.0, (1e-9,) + 7 * (0.0,))
     assert image_of(target, camera, distorted).lens == distorted
-    blind: Any = SimpleNamespace(nominal_lens=own, name="blind")
+    blind: Any = SimpleNamespace(nominal_lens=nominal, name="blind")
     with pytest.raises(UserError, match="the capture has 9 x 9 pixels, blind has"):
         image_of(target, blind, distorted)
 
@@ -150,10 +153,10 @@ def test_a_peak_is_over_the_quadratic_surface_of_the_ring() -> None:
     z_mm[0, 13] = np.nan
     z_mm[3, 13] = np.nan
     residual_mm, ring = _residual_mm(plan_mm, z_mm * MM)
-    known = np.isfinite(z_mm)
+    is_known = np.isfinite(z_mm)
     added_mm = bump_mm + object_mm + rough_mm
-    assert residual_mm[known] == pytest.approx(added_mm[known], abs=0.012)
-    in_ring = (distance > 6.5) & (distance < 13.5) & known
+    assert residual_mm[is_known] == pytest.approx(added_mm[is_known], abs=0.012)
+    in_ring = (distance > 6.5) & (distance < 13.5) & is_known
     assert np.array_equal(ring, in_ring & (object_mm == 0.0))
 
 
@@ -208,7 +211,7 @@ def test_the_readings_of_a_board_are_the_planted_ones(monkeypatch: pytest.Monkey
     close = np.eye(4)
     close[2, 3] = 0.02
     target = target_of(*centres, T_camera_board=close)
-    found = [(np.array([0.3, 0.0]), 1), (np.array([-30.0, -12.0]), 2)]
+    peaks = [(np.array([0.3, 0.0]), 1), (np.array([-30.0, -12.0]), 2)]
 
     def load_detector(name: str, settings: dict[str, Any]) -> Any:
         assert (name, settings) == ("fake", {"a": 1})
@@ -216,8 +219,8 @@ def test_the_readings_of_a_board_are_the_planted_ones(monkeypatch: pytest.Monkey
         def find(cloud: Any, evidence: Any, k: float) -> list[Any]:
             assert (evidence, k) == ("evidence", 3.0)
             spots = []
-            for place, reach in found:
-                away = np.linalg.norm(image.plan_mm.reshape(-1, 2) - place, axis=1)
+            for centre, reach in peaks:
+                away = np.linalg.norm(image.plan_mm.reshape(-1, 2) - centre, axis=1)
                 spots.append(SimpleNamespace(pixels=np.flatnonzero(away < reach)))
             return spots
 

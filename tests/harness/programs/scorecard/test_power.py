@@ -49,8 +49,8 @@ figures:
 
 
 def constant(value: Any, key: str = "unit.jitter_mm", **others: Any) -> Constant:
-    given = {"camera": AZURE, "tag": "M", "limits": None, **others}
-    return Constant(key=key, value=value, **given)
+    constant = {"camera": AZURE, "tag": "M", "limits": None, **others}
+    return Constant(key=key, value=value, **constant)
 
 
 # ---- which constants, and how far
@@ -218,9 +218,9 @@ def test_the_effects_of_a_quantity_are_those_it_is_measured_with(
         with pytest.raises(InterruptedError):
             quantity.measure(Bench(AZURE, BRIEF), quantity.conditions())
         (effects,) = used
-        on = {key for key, is_on in effects.to_data().items() if is_on}
+        switched_on = {key for key, is_on in effects.to_data().items() if is_on}
         declared = {key for key, is_on in quantity.effects.to_data().items() if is_on}
-        assert on <= declared, name
+        assert switched_on <= declared, name
 
 
 def test_a_small_change_across_a_limit_is_not_noticed(

@@ -183,20 +183,20 @@ def test_products_within_patches_by_hand(monkeypatch: pytest.MonkeyPatch) -> Non
     frames = tuple(1.0 + height * stripes * MM for height in (1.0, 2.0))
     monkeypatch.setattr(quantities, "_single_frames", lambda *_: frames)
     variance, product = quantities._patch_products(BENCH, PatchConditions(patch_px=8, apart_px=2))
-    left = _left_of_patches(frames[0][:, :8], 8)[0]
-    beside = (left[:, 2:] * left[:, :-2]).mean()
-    below = (left[2:] * left[:-2]).mean()
+    edges = _left_of_patches(frames[0][:, :8], 8)[0]
+    beside = (edges[:, 2:] * edges[:, :-2]).mean()
+    below = (edges[2:] * edges[:-2]).mean()
     assert beside < -0.5 < 0.5 < below
     assert product == pytest.approx(np.outer([1.0, 4.0], 2 * [(beside + below) / 2]))
-    assert variance == pytest.approx(np.outer([1.0, 4.0], 2 * [left.var()]))
+    assert variance == pytest.approx(np.outer([1.0, 4.0], 2 * [edges.var()]))
     deviation = value("patch_deviation_mm", patch_px=8)
-    assert deviation == pytest.approx(1.5 * left.std())
+    assert deviation == pytest.approx(1.5 * edges.std())
     correlation = value("patch_correlation", patch_px=8, apart_px=2)
-    assert correlation == pytest.approx((beside + below) / 2 / left.var())
+    assert correlation == pytest.approx((beside + below) / 2 / edges.var())
     # in steps of 2.5 mm, stripes of 1 mm vanish and those of 2 mm have 2.5 mm
     coarse, _ = quantities._patch_products(BENCH, PatchConditions(patch_px=8, rounded_mm=2.5))
     assert coarse[0] == pytest.approx([0.0, 0.0], abs=1e-12)
-    assert coarse[1] == pytest.approx(2 * [2.5**2 * left.var()])
+    assert coarse[1] == pytest.approx(2 * [2.5**2 * edges.var()])
 
 
 def test_a_single_frame_is_taken_of_each_unit(units: list[tuple[int, int | None]]) -> None:

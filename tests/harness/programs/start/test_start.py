@@ -40,13 +40,13 @@ def type_lines(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 
 def proposed(printed: str) -> list[str]:
     """Return the commands that were printed, each of which its program understands."""
-    found = []
+    commands = []
     for line in printed.splitlines():
         if line.startswith("  tofpod "):
-            _, name, *given = shlex.split(line, comments=True)
-            importlib.import_module(MODULES[name]).main.parser().parse_args(given)
-            found.append(line.partition("#")[0].strip())
-    return found
+            _, name, *arguments = shlex.split(line, comments=True)
+            importlib.import_module(MODULES[name]).main.parser().parse_args(arguments)
+            commands.append(line.partition("#")[0].strip())
+    return commands
 
 
 def test_answers_by_options_ask_nothing(home: Path, monkeypatch, capsys) -> None:
