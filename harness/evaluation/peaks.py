@@ -64,11 +64,11 @@ def threshold_from_peaks(
         value = tail.score_at(wanted)
         error = tail.error_of_log_count(value)
         half = float(stats.norm.ppf(UPPER)) * error
-        ends = rate_per_m2 * np.exp([-half, half])
+        low, high = (rate_per_m2 * np.exp([-half, half])).tolist()
         return RateThreshold(
             value=value,
             error=error / tail.hazard(value),
-            interval_per_m2=Interval(*ends.tolist()),
+            interval_per_m2=Interval(low, high),
             method="tail of the strongest findings",
         )
     return _by_order(highest, area_m2, by_order.value, by_order.calling_runs)

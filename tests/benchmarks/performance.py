@@ -259,9 +259,11 @@ def peers_of_registration(runs: int) -> None:
     config = IcpRegistration(points="target")
 
     def theirs() -> np.ndarray:
-        fixed, moving = (
-            o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points_m)) for view in views
-        )
+        clouds = []
+        for view in views:
+            points = o3d.utility.Vector3dVector(view.points_m)
+            clouds.append(o3d.geometry.PointCloud(points))
+        fixed, moving = clouds
         point = o3d.pipelines.registration.TransformationEstimationPointToPoint()
         T = guess
         for limit in (0.03, 0.015, 0.012):

@@ -26,7 +26,11 @@ from harness.vocabulary.geometry import Cloud, Region, invert, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION
 from tests.support import marked_board as board
 
-POSES = tuple(board.T_camera_board(*turn) for turn in ((3.0, 2.0), (20.0, -3.0), (-18.0, 5.0)))
+POSES = (
+    board.T_camera_board(3.0, 2.0),
+    board.T_camera_board(20.0, -3.0),
+    board.T_camera_board(-18.0, 5.0),
+)
 T_FIRST_VIEW = tuple(POSES[0] @ invert(pose) for pose in POSES)
 HOLE_M = transform_points(POSES[0], np.array([*board.HOLE_M, 0.0]))
 CORNERS_M = transform_points(

@@ -36,7 +36,8 @@ def kind(make: Callable[[Rng], Stranger]) -> Callable[[Rng], Stranger]:
 
 def camera(rng: Rng, *among: tuple[int, int, float]) -> Camera:
     """A camera with its centre a few pixels off the image's."""
-    width, height, f = (among or CAMERAS)[int(rng.integers(len(among or CAMERAS)))]
+    choices = among or CAMERAS
+    width, height, f = choices[int(rng.integers(len(choices)))]
     cx = (width - 1) / 2 + rng.uniform(-0.02, 0.02) * width
     cy = (height - 1) / 2 + rng.uniform(-0.04, 0.04) * height
     return Camera(width, height, f, float(cx), float(cy))
@@ -424,22 +425,22 @@ def cabled_wall(rng: Rng) -> Stranger:
     cables = []
     keep_off = []
     steps = int(rng.integers(2, 5))
-    for centrem in np.linspace(-0.28, 0.28, steps) * d * cam.width / cam.f_px:
+    for centre_m in np.linspace(-0.28, 0.28, steps) * d * cam.width / cam.f_px:
         radius = rng.uniform(0.004, 0.012)
         high = radius + rng.uniform(0.0, 0.06)
         turn = float(rng.uniform(-12, 12))
-        base = target.point_m(float(centrem), 0.0) - target.R @ np.array([0, 0, high + radius])
+        base = target.point_m(float(centre_m), 0.0) - target.R @ np.array([0, 0, high + radius])
         turned_R = target.R @ cv2.Rodrigues(np.array([0.0, 0.0, np.radians(turn)]))[0]
         cables.append(
             Surface(base, turned_R, 0.999 * radius, 3.0, "cylinder", radius, is_object=True)
         )
-        keep_off.append((centrem, turn, radius))
+        keep_off.append((centre_m, turn, radius))
     target = damaged(rng, cam, target, 9, radius_mm=(6, 14), depth_mm=(4, 10))
     free = []
     for damage in target.damages:
         clear = True
-        for centrem, turn, radius in keep_off:
-            off = damage.x_m - centrem + damage.y_m * np.tan(np.radians(turn))
+        for centre_m, turn, radius in keep_off:
+            off = damage.x_m - centre_m + damage.y_m * np.tan(np.radians(turn))
             clear = clear and abs(off) > damage.radius_m + radius + 0.035
         if clear:
             free.append(damage)

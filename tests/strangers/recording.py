@@ -289,7 +289,9 @@ def _truth(
     depths = sorted((float(least), float(along_z)))
     tapered = damage.profile in ("bowl", "cosine", "cone")
     inner = (0.5 if tapered else 1.0) * 2 * damage.radius_m
-    kind = "no return" if absent else "bump" if damage.depth_m < 0 else "hole"
+    kind = "bump" if damage.depth_m < 0 else "hole"
+    if absent:
+        kind = "no return"
     return Truth(
         centre_m=tuple(float(v) for v in surface.point_m(damage.x_m, damage.y_m)),  # type: ignore[arg-type]
         radius_m=extent,

@@ -205,12 +205,12 @@ def _misjudged(
         before = len(why)
         pitch_mm = 1e3 * truth.centre_m[2] / stranger.camera.f_px
         diameter = float(row["diameter_mm"] or "nan")
-        low, high = (1e3 * d for d in truth.diameter_m)
+        low, high = [1e3 * end_m for end_m in truth.diameter_m]
         slack = PIXELS * pitch_mm
         if diameter < low / FACTOR - slack or diameter > high * FACTOR + slack:
             why.append(f"diameter {diameter:.0f} mm of {low:.0f}..{high:.0f}")
         depth = abs(float(row["depth_mm"] or "nan"))
-        low, high = (1e3 * d for d in truth.depth_m)
+        low, high = [1e3 * end_m for end_m in truth.depth_m]
         slack = 1e3 * SIGMAS * truth.noise_m
         judged = (
             "no return" not in (row["kind"], truth.kind) and 2e3 * truth.radius_m >= 5 * pitch_mm
@@ -223,6 +223,6 @@ def _misjudged(
 
 
 def _shown(truth: Truth) -> str:
-    x, y, z = (1e3 * v for v in truth.centre_m)
+    x, y, z = [1e3 * coordinate_m for coordinate_m in truth.centre_m]
     size = f"{2e3 * truth.radius_m:.0f} mm wide, {1e3 * truth.depth_m[0]:.1f} deep"
     return f"{truth.kind} {size} at {x:.0f} {y:.0f} {z:.0f}"

@@ -92,9 +92,11 @@ def _meet(pose: np.ndarray, slopes: np.ndarray, height_m: float) -> tuple[np.nda
     """z (...) where rays meet the plane ``height_m`` above the face, and the place (..., 2) on the
     board."""
     normal = pose[:3, 2]
+    middle_m = pose[:3, 3]
     rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
-    z_m = (pose[:3, 3] @ normal + height_m) / (rays @ normal)
-    return z_m, transform_points(invert(pose), rays * z_m[..., None])[..., :2]
+    z_m = (middle_m @ normal + height_m) / (rays @ normal)
+    on_board_m = transform_points(invert(pose), rays * z_m[..., None])
+    return z_m, on_board_m[..., :2]
 
 
 def _on_board(xy: np.ndarray) -> np.ndarray:

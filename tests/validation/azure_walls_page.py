@@ -339,9 +339,8 @@ def _numbers(checks: Sequence[WallCheck], camera: AmcwCamera) -> str:
     needed = _listed(f"{c.needed_albedo:.2f} ({c.wall.name})" for c in checks)
     ratios = [np.array([b.ratio for b in c.by_range_inner]) for c in checks]
     spread = max(float(np.abs(r / r.mean() - 1).max()) for r in ratios)
-    real, ours = (
-        _listed(f"{_mm(c.jitter_m[i])} mm ({c.wall.name})" for c in checks) for i in (0, 1)
-    )
+    real = _listed(f"{_mm(c.jitter_m[0])} mm ({c.wall.name})" for c in checks)
+    ours = _listed(f"{_mm(c.jitter_m[1])} mm ({c.wall.name})" for c in checks)
     pattern = _listed(f"{_mm(c.pattern.std_m)} mm" for c in checks)
     length = _listed(f"{length_px(c.pattern):.1f} px" for c in checks)
     return f"""- **Noise** grows with range like the measured one: in the lit cone each wall's ratios lie within

@@ -132,7 +132,10 @@ def _set_up(
     names = np.tile([str(1 + hole) for hole in range(size.holes)], size.boards)
     zero = np.zeros(n)
     repeat = np.zeros(n, int)
-    sizes = (np.full(n, 10.0), size_mm) if model.depth else (size_mm, np.full(n, 12.7))
+    diameter_mm = np.full(n, 10.0) if model.depth else size_mm
+    depth_mm = size_mm if model.depth else np.full(n, 12.7)
+    first_runs = np.zeros(len(calibration), int)
+    at_middle = np.zeros(len(calibration))
     return SetUpRecord(
         variant=f"set-up {number}",
         frames=1,
@@ -146,7 +149,15 @@ def _set_up(
         targets_digest=str(boards_seed),
         frames_digest=f"{boards_seed} {noise_seed}",
         inspected=Inspected(
-            board, names, repeat, *sizes, zero, zero, signal > change.bias * threshold, signal
+            board=board,
+            hole=names,
+            repeat=repeat,
+            diameter_mm=diameter_mm,
+            depth_mm=depth_mm,
+            x_mm=zero,
+            y_mm=zero,
+            hit=signal > change.bias * threshold,
+            signal=signal,
         ),
         unflawed=Unflawed(
             np.arange(size.hole_free_boards),
@@ -155,7 +166,11 @@ def _set_up(
             np.full(size.hole_free_boards, AREA_M2),
         ),
         calibrated=Calibrated(
-            *np.zeros((2, len(calibration)), int), calibration, *np.zeros((2, len(calibration)))
+            board=first_runs,
+            repeat=first_runs,
+            score=calibration,
+            x_mm=at_middle,
+            y_mm=at_middle,
         ),
         threshold_error=ThresholdError(
             error=calibrated.error,

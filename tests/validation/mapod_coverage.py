@@ -135,12 +135,18 @@ def coverage(
         true_mm = truth.size_at(0.9)
         alone = [measured_limit(size, hit) for hit in hits[:MEASURED, number]]
         scaled = limits[:, number] / true_mm
-        sizes = (
-            float(np.median(scaled)),
-            float(np.quantile(scaled, 0.9)),
-            float(np.median(alone)) / true_mm,
+        k, w = case
+        row = Coverage(
+            k=k,
+            w=w,
+            holes=holes,
+            campaigns=campaigns,
+            covered=float((scaled >= 1).mean()),
+            median=float(np.median(scaled)),
+            high=float(np.quantile(scaled, 0.9)),
+            measured=float(np.median(alone)) / true_mm,
         )
-        rows.append(Coverage(*case, holes, campaigns, float((scaled >= 1).mean()), *sizes))
+        rows.append(row)
     return rows
 
 

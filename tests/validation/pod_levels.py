@@ -113,7 +113,9 @@ def weighted(
         step = inside[1] - inside[0]
         steps = np.arange(1, middles + 1)
         middle = np.concatenate([x.min() - step * steps[::-1], inside, x.max() + step * steps])
-        all_middles, all_widths = (grid.ravel() for grid in np.meshgrid(middle, np.exp(log_width)))
+        middle_grid, width_grid = np.meshgrid(middle, np.exp(log_width))
+        all_middles = middle_grid.ravel()
+        all_widths = width_grid.ravel()
         mu, sigma = curves_of(link, all_middles, all_widths * range_x)
         log_hit, log_miss, _ = logs_of_link(link, (x[:, None] - mu) / sigma)
         log_hit = np.maximum(log_hit, -1e6).astype(np.float32)

@@ -204,7 +204,9 @@ def _narrowed(fit: HitMissFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for _ in range(ZOOMS):
         middles = np.linspace(middle_ends[0], middle_ends[1], MIDDLES)
         log_widths = np.linspace(width_ends[0], width_ends[1], WIDTHS)
-        middle, log_width = (grid.ravel() for grid in np.meshgrid(middles, log_widths))
+        middle_grid, log_width_grid = np.meshgrid(middles, log_widths)
+        middle = middle_grid.ravel()
+        log_width = log_width_grid.ravel()
         width = np.exp(log_width)
         mu, sigma = curves_of(fit.curve.link, middle, width * range_z)
         log_likelihood = _log_likelihoods(fit, mu, sigma) / fit.repeats

@@ -256,7 +256,8 @@ def _p_values(row: ComparedSetUps) -> tuple[Tails | None, Tails | None, Tails | 
     if row.by_signals is not None:
         tests.append((row.by_signals.grown_p, row.by_signals.shrunk_p))
     # the best of several tests counts as often as there are tests
-    worse, better = (min(1.0, len(tests) * min(p)) for p in zip(*tests, strict=True))
+    worse = min(1.0, len(tests) * min(worse_p for worse_p, _ in tests))
+    better = min(1.0, len(tests) * min(better_p for _, better_p in tests))
     return (worse, better), calls, signal
 
 

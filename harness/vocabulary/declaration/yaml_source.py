@@ -201,8 +201,9 @@ class Source:
                     if path_there[:depth] == donor_path
                 }
             )
-        merged[1][path] = donor.place_of(donor_path)
-        return Source(self.origin, self.text, data, *merged)
+        values, keys = merged
+        keys[path] = donor.place_of(donor_path)
+        return Source(self.origin, self.text, data, values, keys)
 
 
 def read_yaml(path: Path) -> Source:

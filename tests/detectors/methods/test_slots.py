@@ -24,8 +24,11 @@ def seen(length_px: float, width_px: float, angle_deg: float, window_px: int) ->
     finer = 8
     height, width = SHAPE
     rows, columns = (np.indices((height * finer, width * finer)) + 0.5) / finer - 0.5
-    turned = (columns - MIDDLE[1] + 1j * (rows - MIDDLE[0])) * np.exp(-1j * np.radians(angle_deg))
-    inside = (np.abs(turned.real) < length_px / 2) & (np.abs(turned.imag) < width_px / 2)
+    from_middle = (columns - MIDDLE[1]) + 1j * (rows - MIDDLE[0])
+    turned = from_middle * np.exp(-1j * np.radians(angle_deg))
+    along = turned.real
+    across = turned.imag
+    inside = (np.abs(along) < length_px / 2) & (np.abs(across) < width_px / 2)
     pixels = inside.reshape(height, finer, width, finer).mean(axis=(1, 3))
     lens = cv2.GaussianBlur(pixels, (0, 0), templates.LENS_BLUR_PX)
     return cv2.blur(lens, (window_px, window_px)).astype(np.float32)

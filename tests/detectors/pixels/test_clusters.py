@@ -76,9 +76,11 @@ def test_points_are_joined_up_to_the_distance_and_no_farther(direction) -> None:
 
 def directions(seed: int, count: int) -> np.ndarray:
     """Unit vectors (n, 3): all along axes and diagonals, and ``count`` random ones."""
-    grid = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
+    ticks = [-1, 0, 1]
+    grid = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+    regular = grid[np.any(grid != 0, axis=1)]
     random = np.random.default_rng(seed).normal(size=(count, 3))
-    vectors = np.concatenate([grid[np.any(grid != 0, axis=1)], random])
+    vectors = np.concatenate([regular, random])
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 

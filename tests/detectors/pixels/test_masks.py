@@ -36,7 +36,9 @@ def rough_points(seed: int, h: int = 23, w: int = 31) -> np.ndarray:
     """A surface with steps, creases, noise and pixels without a point."""
     random = np.random.default_rng(seed)
     v, u = np.mgrid[:h, :w]
-    z = 0.7 + 0.01 * np.abs(u - 15) + 0.02 * (v > 11) + 2e-3 * random.standard_normal((h, w))
+    crease = 0.01 * np.abs(u - 15)
+    step = 0.02 * (v > 11)
+    z = 0.7 + crease + step + 2e-3 * random.standard_normal((h, w))
     z[random.random((h, w)) < 0.05] = np.nan
     return np.stack([u * 1.4e-3 * z, v * 1.4e-3 * z, z], axis=-1)
 
@@ -49,9 +51,10 @@ def by_graph(nodes: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarr
     below = down[:-1] & nodes[:-1] & nodes[1:]
     starts = np.concatenate([pixels[:, :-1][across], pixels[:-1][below]])
     ends = np.concatenate([pixels[:, 1:][across], pixels[1:][below]])
-    graph = coo_array((np.ones(len(starts)), (starts, ends)), shape=(nodes.size, nodes.size))
-    labels = connected_components(graph, directed=False)[1].reshape(nodes.shape)
-    return np.where(nodes, labels, -1)
+    links = np.ones(len(starts))
+    graph = coo_array((links, (starts, ends)), shape=(nodes.size, nodes.size))
+    _, labels = connected_components(graph, directed=False)
+    return np.where(nodes, labels.reshape(nodes.shape), -1)
 
 
 @pytest.mark.parametrize("central", [False, True])

@@ -193,9 +193,12 @@ def test_inches_are_asked_for_and_read(tmp_path: Path) -> None:
 
 
 def test_lengths_along_the_rays_are_told_from_z(tmp_path: Path) -> None:
-    z_m = 0.7 + np.random.default_rng(2).normal(0, 1e-4, (72, 96)) + 0.1 * plane.slopes()[..., 0]
-    along = z_m * np.linalg.norm(np.dstack([plane.slopes(), np.ones_like(z_m)]), axis=-1)
-    for name, stored, doubts in (("z", z_m, 0), ("range", along, 1)):
+    slopes = plane.slopes()
+    noise_m = np.random.default_rng(2).normal(0, 1e-4, (72, 96))
+    z_m = 0.7 + noise_m + 0.1 * slopes[..., 0]
+    rays = np.dstack([slopes, np.ones_like(z_m)])
+    range_m = z_m * np.linalg.norm(rays, axis=-1)
+    for name, stored, doubts in (("z", z_m, 0), ("range", range_m, 1)):
         np.save(tmp_path / f"{name}.npy", stored)
         warnings = open_capture([tmp_path / f"{name}.npy"], lens=plane.LENS).warnings
         assert sum("lengths along the rays" in text for text in warnings) == doubts

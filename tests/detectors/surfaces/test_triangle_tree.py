@@ -12,12 +12,14 @@ SCATTERED = DRAWS.uniform(-1.0, 1.0, (83, 1, 3)) + DRAWS.normal(0.0, 0.2, (83, 3
 
 def distances_along(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return where a ray meets each triangle (m, 3, 3): origin + t direction = a + u b + v c."""
-    sides = corners[:, 1:] - corners[:, :1]
-    matrix = np.stack(
-        [np.broadcast_to(-direction, (len(corners), 3)), *sides.transpose(1, 0, 2)], 2
-    )
-    t, u, v = np.linalg.solve(matrix, (origin - corners[:, 0])[..., None])[..., 0].T
-    return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0), t, np.inf)
+    a = corners[:, 0]
+    b = corners[:, 1] - a
+    c = corners[:, 2] - a
+    back = np.broadcast_to(-direction, a.shape)
+    matrix = np.stack([back, b, c], axis=2)
+    t, u, v = np.linalg.solve(matrix, (origin - a)[..., None])[..., 0].T
+    is_inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+    return np.where(is_inside & (t >= 0), t, np.inf)
 
 
 def sampled_distance(corners: np.ndarray, point: np.ndarray) -> float:
@@ -59,7 +61,9 @@ def test_equal_distances_and_flat_boxes() -> None:
     """A flat square of two triangles, twice: boxes without depth, and ties on all of it."""
     square = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[1, 1, 1], [0, 1, 1], [1, 0, 1]]], float)
     tree = tree_of(np.concatenate([square, square]))
-    x, y = (feet.ravel() for feet in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
+    ticks = np.linspace(0, 1, 9)
+    x = np.tile(ticks, 9)
+    y = np.repeat(ticks, 9)
     starts = np.column_stack([x, y, np.zeros(81)])
     number, _ = first_hits(tree, starts, np.tile([0.0, 0.0, 2.0], (81, 1)))
     np.testing.assert_array_equal(number, np.where(x + y <= 1.0, 0, 1))

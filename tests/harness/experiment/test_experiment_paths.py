@@ -86,14 +86,12 @@ def test_set_then_get_and_nothing_else_changes(
     assert data == before
     assert set_path(changed, path, old) == before
     remaining = [
-        changed_pathning_path
-        for changed_pathning_path in paths_in(data)
-        if changed_pathning_path[: len(path)] != path
-        and path[: len(changed_pathning_path)] != changed_pathning_path
+        candidate
+        for candidate in paths_in(data)
+        if candidate[: len(path)] != path and path[: len(candidate)] != candidate
     ]
     assert all(
-        shape.get(changed, changed_pathning_path) is shape.get(data, changed_pathning_path)
-        for changed_pathning_path in remaining
+        shape.get(changed, candidate) is shape.get(data, candidate) for candidate in remaining
     )
     assert key_path(".".join(map(str, path))) == path
 

@@ -140,18 +140,13 @@ def test_blur_carries_a_finding_to_the_rim_by_half_of_its_width() -> None:
     """The fourth row is 4 pixels deep, the fifth 5."""
     plain = judged_of(20.0, 20.0, rows=(3, 4))
     native = with_remarks(plain, 5.0)
-    assert [judged_findingrked.flags for judged_findingrked in native.findings] == ["", ""]
+    assert [remarked.flags for remarked in native.findings] == ["", ""]
     blurred = replace(plain, cloud=replace(plain.cloud, noise_reach_px=8.0))
-    assert [
-        judged_findingrked.flags for judged_findingrked in with_remarks(blurred, 5.0).findings
-    ] == ["at_rim", ""]
+    assert [remarked.flags for remarked in with_remarks(blurred, 5.0).findings] == ["at_rim", ""]
     sides_px = np.full((2, 1, 1), 8.0, np.float32)
     sides_px[1] = 10.0
     wider = replace(plain.cloud, noise_reach_px=8.0, noise_sides_px=sides_px)
-    flags = [
-        judged_findingrked.flags
-        for judged_findingrked in with_remarks(replace(plain, cloud=wider), 5.0).findings
-    ]
+    flags = [remarked.flags for remarked in with_remarks(replace(plain, cloud=wider), 5.0).findings]
     assert flags == ["at_rim", "at_rim"]
 
 

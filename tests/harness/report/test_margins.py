@@ -49,7 +49,7 @@ def test_each_size_has_a_panel_and_one_counts_the_holes(summary: pd.DataFrame) -
     of_hole_1 = np.reshape(margins[0][1:], (-1, 4))
     assert of_hole_1[:, 2].tolist() == list(FRAMES)
     assert of_hole_1[:, 3] == pytest.approx(3 / 4)
-    (counts,) = (line for line in lines if line[0] == "holes found")
+    (counts,) = [line for line in lines if line[0] == "holes found"]
     counts_found = [(summary["status"] == "found")[summary["frames"] == n].sum() for n in FRAMES]
     assert np.reshape(counts[1:], (-1, 4))[:, 3].tolist() == counts_found
     assert counts_found == [7, 8, 8]

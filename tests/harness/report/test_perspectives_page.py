@@ -29,15 +29,19 @@ YAML = "name: perspectives # <few> & many\n"
 METHODS = ("icp", "cpd", "marks")
 
 
+def size_bias_mm(diameter_mm: float, views: int, method: str, merge: str) -> float:
+    if views == 1:
+        return 1.0
+    return 1.4 if diameter_mm < 9 else 0.6
+
+
 @pytest.fixture(scope="module")
 def found():
     world = MapWorld(
         first=lambda views, method, merge, frames: (
             4 + (frames == 1) - (views == 9 and merge == "fusion")
         ),
-        size_bias_mm=lambda d, views, method, merge: (
-            1.0 + (0.0 if views == 1 else 0.4 if d < 9 else -0.4)
-        ),
+        size_bias_mm=size_bias_mm,
         failing={"icp": 0.25},
     )
     tables = perspectives(world, (1, 50), (1, 2, 9), METHODS, ("grid", "fusion"))

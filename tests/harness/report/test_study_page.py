@@ -405,7 +405,8 @@ def test_one_set_up_has_no_axis_and_one_depth_no_surface(single_page: str) -> No
 def test_given_thresholds_and_no_hole_free_boards() -> None:
     study = small(SetUp())
     record: StudyRecord = study_record(study)
-    nothing = Unflawed(*(np.zeros(0, kind) for kind in (int, int, int, float)))
+    no_counts = np.zeros(0, int)
+    nothing = Unflawed(board=no_counts, repeat=no_counts, calls=no_counts, area_m2=np.zeros(0))
     set_up = replace(record.set_ups[0], unflawed=nothing, calibration_runs=0)
     record = replace(record, false_calls_per_m2=None, set_ups=(set_up,))
     tables: ResultTables = study_tables(study)

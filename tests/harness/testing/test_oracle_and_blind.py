@@ -190,7 +190,9 @@ def test_the_judged_area_is_the_faces(tilt: float) -> None:
     cloud = plane(seed=1, tilt=tilt)
     h, w = SHAPE
     slopes = LENS.slopes(np.array([0, w - 1, w - 1, 0]), np.array([0, 0, h - 1, h - 1]))
-    x, y = (slopes * (DISTANCE_M / (1 - tilt * slopes[:, :1]))).T
+    z = DISTANCE_M / (1 - tilt * slopes[:, 0])
+    x = slopes[:, 0] * z
+    y = slopes[:, 1] * z
     across = 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
     true = across * np.hypot(1.0, tilt)
     assert judged_area_m2(cloud, cloud.valid) == pytest.approx(true, rel=0.01)

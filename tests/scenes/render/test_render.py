@@ -93,12 +93,14 @@ def test_plane_range_to_micrometres_and_amplitude_by_lambert(a, b):
     hits = cast(scene_of(quad(corners, albedo=0.37)), SLOPES)
     z = 0.8 / (1 - a * SLOPES[:, 0] - b * SLOPES[:, 1])
     points = np.column_stack([SLOPES, np.ones(len(SLOPES))]) * z[:, None]
+    range_m = np.linalg.norm(points, axis=1)
     to_emitter = EMITTER - points
-    leg = np.linalg.norm(to_emitter, axis=1)
+    leg_m = np.linalg.norm(to_emitter, axis=1)
     normal = np.array([a, b, -1]) / np.sqrt(a * a + b * b + 1)
-    assert np.abs(hits.range_m - np.linalg.norm(points, axis=1)).max() < 1e-6
-    assert np.abs(hits.path_m - np.linalg.norm(points, axis=1) - leg).max() < 1e-6
-    assert hits.amplitude == pytest.approx(0.37 * (to_emitter @ normal) / leg**3, rel=2e-6)
+    cosine = (to_emitter @ normal) / leg_m
+    assert np.abs(hits.range_m - range_m).max() < 1e-6
+    assert np.abs(hits.path_m - range_m - leg_m).max() < 1e-6
+    assert hits.amplitude == pytest.approx(0.37 * cosine / leg_m**2, rel=2e-6)
 
 
 def test_light_outside_the_cone_is_none_and_the_roll_off_linear_in_the_cosine():

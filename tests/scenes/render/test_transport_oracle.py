@@ -72,8 +72,9 @@ def assert_agree(ours, theirs, here, largest_error):
     in strength (real) and phase (imaginary), lies within 5.4 standard errors (Student's t of 7
     degrees of freedom: alpha 1e-3 a number, 6e-3 a comparison) and 2e-5, our own noise; and the
     errors are below ``largest_error``."""
-    back = np.conj(ours[:, here]) / np.abs(ours[:, here])
-    mean = (theirs[:, :, here] * back).mean(axis=2) / np.abs(ours[:, here]).mean(axis=1)
+    strength = np.abs(ours[:, here])
+    back = np.conj(ours[:, here]) / strength
+    mean = (theirs[:, :, here] * back).mean(axis=2) / strength.mean(axis=1)
     turned = np.ascontiguousarray(mean - 1).view(float)
     error = turned.std(axis=0, ddof=1) / np.sqrt(RUNS)
     assert error.max() < largest_error

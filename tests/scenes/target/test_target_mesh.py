@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -405,14 +406,19 @@ def test_slopes_and_bends_are_the_derivatives(shape: Any) -> None:
     face = face_of(target(shape).board)
     x, y = np.meshgrid(np.linspace(-0.14, 0.14, 7), np.linspace(-0.045, 0.045, 5))
     step = 1e-5
-    along_x = (face.height_m(x + step, y) - face.height_m(x - step, y)) / (2 * step)
-    along_y = (face.height_m(x, y + step) - face.height_m(x, y - step)) / (2 * step)
-    assert face.slope(x, y) == pytest.approx(np.stack([along_x, along_y], -1), abs=1e-7)
-    bend_x = (face.slope(x + step, y) - face.slope(x - step, y)) / (2 * step)
-    bend_y = (face.slope(x, y + step) - face.slope(x, y - step)) / (2 * step)
-    assert face.bend(x, y) == pytest.approx(
-        np.stack([bend_x[..., 0], bend_x[..., 1], bend_y[..., 1]], -1), abs=1e-6
-    )
+
+    def by_x(function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+        return (function(x + step, y) - function(x - step, y)) / (2 * step)
+
+    def by_y(function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+        return (function(x, y + step) - function(x, y - step)) / (2 * step)
+
+    slope = np.stack([by_x(face.height_m), by_y(face.height_m)], axis=-1)
+    assert face.slope(x, y) == pytest.approx(slope, abs=1e-7)
+    slope_by_x = by_x(face.slope)
+    slope_by_y = by_y(face.slope)
+    bend = np.stack([slope_by_x[..., 0], slope_by_x[..., 1], slope_by_y[..., 1]], axis=-1)
+    assert face.bend(x, y) == pytest.approx(bend, abs=1e-6)
     assert face.height_m(0.0, 0.0) == 0.0
 
 

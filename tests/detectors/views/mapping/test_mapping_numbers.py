@@ -354,7 +354,8 @@ def test_triangles_without_a_grid_do_not_cross_a_gap() -> None:
     v, u = np.mgrid[:12, :12].astype(float)
     diagonal = np.sqrt(LONGEST_EDGE**2 - 1.0)
     for gap, is_crossed in ((diagonal - 0.05, True), (LONGEST_EDGE + 0.05, False)):
-        positions = np.stack([u + np.where(u > 5, gap - 1.0, 0.0), v], axis=-1).reshape(1, -1, 2)
+        moved = np.where(u > 5, u + gap - 1.0, u)
+        positions = np.stack([moved, v], axis=-1).reshape(1, -1, 2)
         grid = CellGrid(7.0, 3.0, 1.0, (3, 1))
         raster = raster_between(positions, np.ones((1, 144), bool), False, 1.0, grid)
         assert np.isfinite(raster.at_cells(np.ones(144))).all() == is_crossed

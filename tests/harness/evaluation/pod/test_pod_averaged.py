@@ -31,9 +31,8 @@ def average(targets: int, seed: int, curve: PodCurve = CURVES[0]) -> ModelAverag
 @pytest.mark.parametrize("link", LINKS)
 def test_curves_have_their_middle_and_width(link: str) -> None:
     mu, sigma = curves_of(link, np.array([4.0]), np.array([3.0]))
-    low, half, high = (
-        float(mu[0] + sigma[0] * link_ppf(link, np.array(p))) for p in (0.1, 0.5, 0.9)
-    )
+    quantiles = link_ppf(link, np.array([0.1, 0.5, 0.9]))
+    low, half, high = (mu[0] + sigma[0] * quantiles).tolist()
     assert half == pytest.approx(4.0)
     assert high - low == pytest.approx(3.0)
 

@@ -36,8 +36,8 @@ class Stub:
     """A limit with the intervals that a rule reads."""
 
     def __init__(self, a50: tuple[float, float], a90: tuple[float, float], label: str = "one"):
-        self.a50_interval_mm = Interval(*a50)
-        self.a90_interval_mm = Interval(*a90)
+        self.a50_interval_mm = Interval(low=a50[0], high=a50[1])
+        self.a90_interval_mm = Interval(low=a90[0], high=a90[1])
         self.a50_mm = sum(a50) / 2
         self.a90_mm = sum(a90) / 2
         self.statement: Any = "a curve"

@@ -216,8 +216,9 @@ class TestValidity:
         facts = {"threshold": {"calibrate": {"false_calls_per_m2": 1.0}}}
         assert "(" not in dataclasses.replace(result, facts=facts).conditions
         set_ups = []
-        for set_up, ends in zip(result.set_ups, ((0.5, 1.7), (0.41, 1.6)), strict=True):
-            error = ThresholdError(0.1, *ends, "order statistics")
+        rates_per_m2 = ((0.5, 1.7), (0.41, 1.6))
+        for set_up, (low, high) in zip(result.set_ups, rates_per_m2, strict=True):
+            error = ThresholdError(0.1, low, high, "order statistics")
             record = dataclasses.replace(set_up.limit.record, threshold_error=error)
             limit = dataclasses.replace(set_up.limit, record=record)
             set_ups.append(dataclasses.replace(set_up, limit=limit))

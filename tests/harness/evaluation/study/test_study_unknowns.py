@@ -128,7 +128,8 @@ def test_chance_is_seldom_said_to_matter():
 
 
 def test_the_same_numbers_each_time():
-    first, second = (over_unknowns(drawn_set_up(), draws=50) for _ in range(2))
+    first = over_unknowns(drawn_set_up(), draws=50)
+    second = over_unknowns(drawn_set_up(), draws=50)
     for effect, repeated_effect in zip(first.effects, second.effects, strict=True):
         assert effect.a90_mm.tolist() == repeated_effect.a90_mm.tolist()
         assert effect.factor_interval == repeated_effect.factor_interval

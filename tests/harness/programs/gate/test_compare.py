@@ -143,12 +143,19 @@ def test_boards_are_the_unit_where_damages_are_lost_together():
     assert change.fewer_p == pytest.approx(0.25)
 
 
+def only(inspected: Inspected, rows: np.ndarray) -> Inspected:
+    """The inspections of these rows."""
+    columns = {}
+    for name, column in vars(inspected).items():
+        if isinstance(column, np.ndarray):
+            columns[name] = column[rows]
+    return replace(inspected, **columns)
+
+
 def test_only_shared_inspections_are_compared_in_any_order():
     complete = inspected([0, 0, 1, 1], [True, False, True, True])
     order = np.array([2, 0, 3])
-    part = Inspected(
-        *(column[order] for column in vars(complete).values() if isinstance(column, np.ndarray))
-    )
+    part = only(complete, order)
     rows, two = shared_rows(complete, part)
     assert [(complete.hole[a], part.hole[b]) for a, b in zip(rows, two, strict=True)] == [
         ("0",) * 2,
@@ -186,12 +193,8 @@ def test_paired_draws_make_the_interval_narrower_than_independent_ones():
 def test_boards_missing_in_one_unpair_the_draws():
     study = small().set_ups[0]
     kept = study.inspected.board != study.inspected.board[0]
-    columns = (
-        column[kept] for column in vars(study.inspected).values() if isinstance(column, np.ndarray)
-    )
-    assert not limit_change(
-        limit_of(study), limit_of(replace(study, inspected=Inspected(*columns))), True
-    ).paired
+    without_one = replace(study, inspected=only(study.inspected, kept))
+    assert not limit_change(limit_of(study), limit_of(without_one), True).paired
 
 
 # --- false calls
@@ -518,8 +521,17 @@ def test_the_effective_threshold_is_where_half_of_the_signals_are_found(seed):
     record = replace(small().set_ups[0], threshold=1.1)
 
     def effective(hit: np.ndarray) -> tuple[float, float]:
+        ones = np.ones(n)
         inspected = Inspected(
-            np.arange(n), np.full(n, "1"), np.zeros(n, int), *np.ones((4, n)), hit, signal
+            board=np.arange(n),
+            hole=np.full(n, "1"),
+            repeat=np.zeros(n, int),
+            diameter_mm=ones,
+            depth_mm=ones,
+            x_mm=ones,
+            y_mm=ones,
+            hit=hit,
+            signal=signal,
         )
         return found_from(replace(record, inspected=inspected))
 

@@ -366,7 +366,9 @@ def test_signs_are_those_of_the_shared_boards_sums_over_repeats() -> None:
     assert change.more_p == pytest.approx(2 / 4)
     assert change.fewer_p == pytest.approx(3 / 4)
     assert change.rates_per_m2 == pytest.approx((4 / (6 * AREA_M2), 7 / (12 * AREA_M2)))
-    nothing = Unflawed(*(column[:0] for column in (board, repeat, board, first.area_m2)))
+    nothing = Unflawed(
+        board=board[:0], repeat=repeat[:0], calls=board[:0], area_m2=first.area_m2[:0]
+    )
     for empty in (first, nothing):
         pair = (unflawed([], unflawed=nothing), unflawed([], unflawed=empty))
         assert calls_change(*pair, None) is None

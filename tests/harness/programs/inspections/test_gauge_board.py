@@ -16,7 +16,7 @@ from harness.programs.inspections.gauge_board import (
     GaugeSeen,
     _matched,
 )
-from harness.vocabulary.geometry import MM, invert
+from harness.vocabulary.geometry import MM, invert, transform_points
 
 COUNTED = ("plane 1", 5.0, 10.0)
 HOLES = (
@@ -41,8 +41,9 @@ def in_camera(places_mm: Any, behind_m: float = 0.0) -> np.ndarray:
     """Points of the board's face, moved along their lines of sight."""
     positions = np.atleast_2d(np.array(places_mm, float)) * MM
     points = np.column_stack([positions, np.zeros(len(positions))])
-    camera_points = points @ pose()[:3, :3].T + pose()[:3, 3]
-    return camera_points * (1 + behind_m / np.linalg.norm(camera_points, axis=1, keepdims=True))
+    camera_points = transform_points(pose(), points)
+    range_m = np.linalg.norm(camera_points, axis=1, keepdims=True)
+    return camera_points * (1 + behind_m / range_m)
 
 
 def judged_with(

@@ -40,7 +40,13 @@ def verdict(
 def rate(many: float, few: float, of: int) -> World:
     """The thesis' answer but for one hole, detected at these rates."""
     usual = World().rate
-    return World(rate=lambda hole, n: (many if n == 50 else few) if hole == of else usual(hole, n))
+
+    def of_hole(hole: int, frames: int) -> float:
+        if hole != of:
+            return usual(hole, frames)
+        return many if frames == 50 else few
+
+    return World(rate=of_hole)
 
 
 CASES = {

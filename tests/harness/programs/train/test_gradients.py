@@ -89,7 +89,11 @@ def trained(seed: int, steps: int) -> tuple[Network, list[float]]:
     losses = []
     for number in range(steps):
         example = example_of(number % 8)
-        single = Example(*(np.asarray(part, np.float32) for part in example))
+        single = Example(
+            pictures=np.asarray(example.pictures, np.float32),
+            damage=np.asarray(example.damage, np.float32),
+            weights=np.asarray(example.weights, np.float32),
+        )
         loss, gradients = gradient_of(network, single)
         descent.step(gradients)
         losses.append(loss)

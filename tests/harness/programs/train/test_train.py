@@ -57,14 +57,14 @@ def test_the_same_command_gives_the_same_file_and_another_seed_another(home):
     assert train_tiny(home, "b.npz") == 0
     first = read_network(home / "a.npz")
     again = read_network(home / "b.npz")
-    for layer, repeatedd in zip(first.layers, again.layers, strict=True):
-        np.testing.assert_array_equal(layer.weights, repeatedd.weights)
-        np.testing.assert_array_equal(layer.bias, repeatedd.bias)
+    for layer, repeated in zip(first.layers, again.layers, strict=True):
+        np.testing.assert_array_equal(layer.weights, repeated.weights)
+        np.testing.assert_array_equal(layer.bias, repeated.bias)
     assert {**first.facts, "provenance": 0} == {**again.facts, "provenance": 0}
     assert train_tiny(home, "c.npz", "--set", "seed=4") == 0
-    repeatedd = read_network(home / "c.npz")
-    assert repeatedd.facts["content"] != first.facts["content"]
-    assert not np.array_equal(repeatedd.layers[0].weights, first.layers[0].weights)
+    with_other_seed = read_network(home / "c.npz")
+    assert with_other_seed.facts["content"] != first.facts["content"]
+    assert not np.array_equal(with_other_seed.layers[0].weights, first.layers[0].weights)
 
 
 def test_the_file_says_what_it_was_trained_on(home):
