@@ -189,15 +189,19 @@ def _slots(
     # blur leaves the volume, so that a narrower slot may be a less deep one
     shares = np.hypot(diameter_errors_m / diameters_m, depth_errors_m / depths_m)
     width_errors_m = widths_m * shares
+    centres_m = np.array([_centre(measured) for measured in chosen]).reshape(-1, 3)
+    directions = np.array([measured.along for measured in chosen]).reshape(-1, 3)
+    points = np.array([measured.points for measured in chosen])
+    errors_m = np.column_stack([width_errors_m, depth_errors_m])
     return _Slots(
         numbers=np.array(numbers, np.int64),
-        centres_m=np.array([_centre(measured) for measured in chosen]).reshape(-1, 3),
-        along=np.array([measured.along for measured in chosen]).reshape(-1, 3),
+        centres_m=centres_m,
+        along=directions,
         lengths_m=np.array([measured.length_m for measured in chosen]),
         widths_m=widths_m,
         depths_m=depths_m,
-        areas_m2=np.array([measured.points * _centre(measured)[2] ** 2 for measured in chosen]),
-        errors=np.nan_to_num(np.column_stack([width_errors_m, depth_errors_m])),
+        areas_m2=points * centres_m[:, 2] ** 2,
+        errors=np.nan_to_num(errors_m),
         deepest_m=np.array(deepest_m),
         cut=np.array(cut, bool),
         is_long=np.array(long, bool),

@@ -239,10 +239,8 @@ def surroundings_of(
     ring_m = residual_m[ring]
     offset_m = median_of(ring_m)
     noise_m = sigma_of(ring_m - offset_m)
-    # large residuals that do not touch the detection are other damage; the blur spreads it
-    limit_m = OTHER_DAMAGE_SIGMAS * max(noise_m, 1e-9)
-    stands_out = (np.abs(residual_m - offset_m) > limit_m) | detected
-    other_damage = stands_out & ~parts_with(stands_out, detected)
+    other_damage = _other_damage(residual_m - offset_m, noise_m, detected)
+    # the blur spreads it
     used = finite & (detected | ~grown(other_damage, reach_px))
     deviations_m = residual_m[detected & finite] - offset_m
     sign = 1.0 if deviations_m.sum() >= 0 else -1.0
@@ -258,15 +256,7 @@ def surroundings_of(
         sights=_sights(cloud, origin_m, per_px_m, config),
         shared_px=blur_px,
     )
-    axis = np.array([0.0, 0.0, 1.0])
-    ray = axis
-    if cloud.projection == "central":
-        ray = origin_m / origin_m[2]
-    # depth along the normal over z along the ray, and over the residual
-    ray_share = _cosine(per_px_m, ray)
-    normal_share = ray_share
-    if evidence.residual_along == "axis":
-        normal_share = _cosine(per_px_m, axis)
+    normal_share, sight_share = _shares_of_residual(cloud, evidence, origin_m, per_px_m)
     return Surroundings(
         patch=patch,
         detected=detected,
@@ -278,13 +268,38 @@ def surroundings_of(
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
         normal_share=normal_share,
-        sight_share=normal_share / ray_share * float(np.linalg.norm(ray)),
+        sight_share=sight_share,
         u0=u0,
         v0=v0,
         origin_m=origin_m,
         per_px_m=per_px_m,
         blurs=_blurs_of(cloud),
     )
+
+
+def _other_damage(deviations_m: np.ndarray, noise_m: float, detected: np.ndarray) -> np.ndarray:
+    """Return the pixels (h, w) bool of large residuals, less the offset, (h, w) that do not touch
+    the detection: other damage."""
+    limit_m = OTHER_DAMAGE_SIGMAS * max(noise_m, 1e-9)
+    stands_out = (np.abs(deviations_m) > limit_m) | detected
+    return np.asarray(stands_out & ~parts_with(stands_out, detected))
+
+
+def _shares_of_residual(
+    cloud: Cloud, evidence: Evidence, origin_m: np.ndarray, per_px_m: np.ndarray
+) -> tuple[float, float]:
+    """Return the depth normal to the surface, and that along the line of sight, over the
+    residual, at the surface's point ``origin_m`` (3,)."""
+    axis = np.array([0.0, 0.0, 1.0])
+    ray = axis
+    if cloud.projection == "central":
+        ray = origin_m / origin_m[2]
+    # depth along the normal over z along the ray
+    ray_share = _cosine(per_px_m, ray)
+    normal_share = ray_share
+    if evidence.residual_along == "axis":
+        normal_share = _cosine(per_px_m, axis)
+    return normal_share, normal_share / ray_share * float(np.linalg.norm(ray))
 
 
 def _cosine(per_px_m: np.ndarray, direction: np.ndarray) -> float:

@@ -168,16 +168,17 @@ def _panel_face(shape: custom.PanelConfig) -> Face:
     width_m = shape.swage_width_mm * MM
 
     def panel(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        step = np.tanh((y - y0_m) / width_m)
         bowl = (bend_x * x**2 + bend_y * y**2) / 2
-        return (
-            bowl + high_m * (step + np.tanh(y0_m / width_m)),
-            bend_x * x,
-            bend_y * y + high_m / width_m * (1 - step**2),
-            np.full(x.shape, bend_x),
-            np.zeros(x.shape),
-            bend_y - 2 * high_m / width_m**2 * step * (1 - step**2),
-        )
+        # the derivative of tanh t is 1 - tanh^2 t
+        step = np.tanh((y - y0_m) / width_m)
+        rise = 1 - step**2
+        height = bowl + high_m * (step + np.tanh(y0_m / width_m))
+        by_x = bend_x * x
+        by_y = bend_y * y + high_m / width_m * rise
+        by_xx = np.full(x.shape, bend_x)
+        by_xy = np.zeros(x.shape)
+        by_yy = bend_y - 2 * high_m / width_m**2 * step * rise
+        return height, by_x, by_y, by_xx, by_xy, by_yy
 
     return Face(panel)
 
@@ -234,14 +235,13 @@ def _round_face(shape: custom.CylinderConfig | custom.SphereConfig) -> Face:
     def round_(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         square = radius_m**2 - bent_x * np.square(x) - bent_y * np.square(y)
         root = np.sqrt(np.where(square > 0, square, np.nan))
-        return (
-            sign * (root - radius_m),
-            -sign * (bent_x * x / root),
-            -sign * (bent_y * y / root),
-            -sign * (bent_x * (1 / root + x**2 / root**3)),
-            -sign * (bent_x * bent_y * x * y / root**3),
-            -sign * (bent_y * (1 / root + y**2 / root**3)),
-        )
+        height = sign * (root - radius_m)
+        by_x = -sign * (bent_x * x / root)
+        by_y = -sign * (bent_y * y / root)
+        by_xx = -sign * (bent_x * (1 / root + x**2 / root**3))
+        by_xy = -sign * (bent_x * bent_y * x * y / root**3)
+        by_yy = -sign * (bent_y * (1 / root + y**2 / root**3))
+        return height, by_x, by_y, by_xx, by_xy, by_yy
 
     return Face(round_)
 

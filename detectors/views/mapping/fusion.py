@@ -99,9 +99,8 @@ def between_views(
     of_other = medians(0.5 * (explained[i] + explained[j])[overlapping])
     half_square = np.maximum(0.5 * square / MEDIAN_SQUARE, 1e-16)
     # k - 1 of the k (k - 1) / 2 differences of k views are independent
-    error = (
-        half_square * MEDIAN_ERROR / np.sqrt(2.0 / len(heights) * len(distances_px) / len(parts))
-    )
+    independent = 2.0 / len(heights) * len(distances_px) / len(parts)
+    error = half_square * MEDIAN_ERROR / np.sqrt(independent)
     if repeated:
         target = (half_square - of_other - of_sensor) / error
         first = np.ones_like(distance) / error

@@ -310,23 +310,7 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
     shared = boxes_around > 1
     sums = columns[~shared]
     if shared.any():
-        corners = []
-        for (low, high), (other_low, other_high) in combinations(limits, 2):
-            corner = np.maximum(low, other_low)
-            if (corner <= np.minimum(high, other_high)).all():
-                corners.append(corner)
-        corner = np.min(corners, axis=0)
-        boxes = np.floor((points[shared] - corner) / step_m)
-        if boxes.max() >= MAX_BOXES:
-            extent_m = np.ptp(points[shared], axis=0).max()
-            problem = f"{extent_m:.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
-            fix = "crop the views to the target, or raise merge.step_mm"
-            raise UserError(problem, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
-        x, y, z = boxes.astype(np.int64).T
-        keys = (x << 42) | (y << 21) | z
-        order = np.argsort(keys, kind="stable")
-        starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-        box_sums = np.add.reduceat(columns[shared][order], starts, axis=0)
+        box_sums = _sums_of_boxes(columns[shared], _lowest_corner(limits), step_m)
         sums = np.concatenate([box_sums, sums])
     clouds = [view.cloud for view in views]
     n = sums[:, 9:]
@@ -351,6 +335,36 @@ def _on_grid(views: Sequence[ChosenView], step_m: float) -> Cloud:
         amplitude=amplitude,
         left_out=tuple(reason for cloud in clouds for reason in cloud.left_out),
     )
+
+
+def _lowest_corner(limits: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return the lowest corner (3,) of the overlaps of two clouds each, by the lowest and highest
+    corners (3,) of all clouds, of which at least two overlap."""
+    corners = []
+    for (low, high), (other_low, other_high) in combinations(limits, 2):
+        corner = np.maximum(low, other_low)
+        if (corner <= np.minimum(high, other_high)).all():
+            corners.append(corner)
+    return np.asarray(np.min(corners, axis=0))
+
+
+def _sums_of_boxes(columns: np.ndarray, corner: np.ndarray, step_m: float) -> np.ndarray:
+    """Return the sums (b, c) of the columns (n, c), of which the first three are points, over the
+    boxes that hold any, counted from a corner (3,). Raises UserError if there are too many along
+    an axis."""
+    points = columns[:, :3]
+    boxes = np.floor((points - corner) / step_m)
+    if boxes.max() >= MAX_BOXES:
+        extent_m = np.ptp(points, axis=0).max()
+        problem = f"{extent_m:.3g} m hold too many boxes of {step_m * 1e3:.3g} mm"
+        fix = "crop the views to the target, or raise merge.step_mm"
+        raise UserError(problem, legal=f"up to {MAX_BOXES} boxes along an axis", fix=fix)
+    # one number for each box, with 21 bits for each axis
+    x, y, z = boxes.astype(np.int64).T
+    keys = (x << 42) | (y << 21) | z
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    return np.asarray(np.add.reduceat(columns[order], starts, axis=0))
 
 
 def _columns(view: ChosenView) -> np.ndarray:

@@ -179,7 +179,8 @@ def find_blobs(
     large = [label for label in order if boxes[label, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
     windows = [_window(cloud, inside, coloured, labels, label, boxes[label]) for label in large]
     rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
-    mixed = len(rims) > 0 and bool(np.mean((rims > 0.2) & (rims < 0.8)) >= MIXED_SHARE)
+    is_mixed = (rims > 0.2) & (rims < 0.8)
+    mixed = len(rims) > 0 and bool(np.mean(is_mixed) >= MIXED_SHARE)
     blobs = []
     for _, settled in windows:
         blob = settled(mixed)

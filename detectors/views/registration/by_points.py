@@ -151,7 +151,9 @@ def _covariance(
     # a step moves the points by a pitch, root mean square; a turn about an axis moves points by
     # their distance from it
     squares = np.mean(arm**2, axis=0)
-    sizes = pitch_m / np.sqrt(np.maximum([*(squares.sum() - squares), 1.0, 1.0, 1.0], 1e-12))
+    moved_per_unit = np.ones(6)
+    moved_per_unit[:3] = squares.sum() - squares
+    sizes = pitch_m / np.sqrt(np.maximum(moved_per_unit, 1e-12))
     sizes = np.minimum(sizes, [0.1] * 3 + [pitch_m] * 3)
     steps = np.diag(sizes)
     curvature = np.empty((6, 6))
@@ -163,8 +165,10 @@ def _covariance(
             mixed = (
                 half_cost(product) + half_cost(-product) - half_cost(across) - half_cost(-across)
             )
-            curvature[i, j] = curvature[j, i] = mixed / (4 * part**2 * sizes[i] * sizes[j])
-    return registered.clustered_sandwich(curvature, scores - scores.mean(axis=0), moved_m, pitch_m)
+            curvature[i, j] = mixed / (4 * part**2 * sizes[i] * sizes[j])
+            curvature[j, i] = curvature[i, j]
+    centred_scores = scores - scores.mean(axis=0)
+    return registered.clustered_sandwich(curvature, centred_scores, moved_m, pitch_m)
 
 
 LEAST_VARIANCE = 10 * float(np.finfo(np.float64).eps)
