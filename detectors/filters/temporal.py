@@ -73,7 +73,7 @@ class _History:
 
     settings: TemporalConfig
     """Settings of the filter."""
-    whole: bool
+    has_whole_steps: bool
     """Whether depth is stored in whole steps."""
     last: np.ndarray | None = None
     """Last depth (h, w) of each pixel in steps, 0 for none yet."""
@@ -93,7 +93,7 @@ class _History:
         )
         alpha = np.float32(self.settings.filter_smooth_alpha)
         mean = alpha * units + (np.float32(1) - alpha) * self.last
-        if self.whole:
+        if self.has_whole_steps:
             mean = np.floor(mean)
         kept = ~is_there & has_last & self._persists()
         result = np.where(agrees, mean, units)

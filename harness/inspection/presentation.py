@@ -257,7 +257,7 @@ def _page_html(
         summary=tuple(_summary_rows(run)),
         judged=tuple(_judged_rows(run)),
         facts=tuple(_fact_rows(run)),
-        further=_sections(run),
+        sections=_sections(run),
         files=_files_text(run),
         provenance=provenance,
     )

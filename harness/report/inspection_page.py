@@ -68,7 +68,7 @@ class PageText:
     """What was judged and what not: name and value."""
     facts: tuple[tuple[str, str], ...]
     """How it was judged: name and value."""
-    further: Mapping[str, Markup]
+    sections: Mapping[str, Markup]
     """Further sections by their headings, in order."""
     files: Mapping[str, str]
     """Further files in the folder, with their content."""
@@ -103,7 +103,7 @@ def inspection_html(judged: Judged, scene: Scene3d, text: PageText) -> str:
         present_flags=present_flags(judged.findings),
         judged=definitions(text.judged),
         facts=definitions(text.facts),
-        further=text.further,
+        sections=text.sections,
         files=text.files,
         closing=fold(
             "Versions and command",

@@ -196,15 +196,15 @@ def _covered(
     goals = []
     if options.goal:
         for surveyed in surveys:
-            wanted_mm = size_mm or surveyed.found.sizes_mm[1]
+            wanted_mm = size_mm or surveyed.findable.sizes_mm[1]
             goals += _ways(surveyed, wanted_mm, options.share)
         goals.sort(key=_rank)
     chosen = goals[0]["survey"] if goals else surveys[0]
-    wanted_mm = size_mm or chosen.found.sizes_mm[1]
+    wanted_mm = size_mm or chosen.findable.sizes_mm[1]
     if goals:
         poses = goals[0]["rows"]
     else:
-        poses = _rows(chosen, list(chosen.seen), wanted_mm, given_count, options.suggest)
+        poses = _rows(chosen, list(chosen.visibility), wanted_mm, given_count, options.suggest)
     limits_mm = np.fmin.reduce([row["limits_mm"] for row in poses]) if poses else np.empty(0)
     return _Covered(survey=chosen, size_mm=wanted_mm, poses=poses, goals=goals, limits_mm=limits_mm)
 
@@ -239,7 +239,7 @@ def _patch_rows(covered: _Covered) -> list[dict[str, Any]]:
     patches = covered.survey.patches
     pose_limits_mm = np.stack([row["limits_mm"] for row in covered.poses])
     best = np.nan_to_num(pose_limits_mm, nan=np.inf).argmin(axis=0)
-    views = [covered.survey.seen[row["pose"]] for row in covered.poses]
+    views = [covered.survey.visibility[row["pose"]] for row in covered.poses]
     facts = np.stack([[view.deviation_m, view.cosine, view.range_m] for view in views])
     noise_m, cosine, range_m = facts[best, :, np.arange(len(best))].T
     columns = [
@@ -271,10 +271,10 @@ def _write_page(
     from harness.vocabulary.text import many, show
 
     patches = covered.survey.patches
-    findable = covered.survey.found
+    findable = covered.survey.findable
     poses = covered.poses
     goals = covered.goals
-    warnings = warnings_of(findable, covered.survey.seen)
+    warnings = warnings_of(findable, covered.survey.visibility)
     added = len(poses) - given_count
     if added < options.suggest:
         warnings.insert(
@@ -318,7 +318,7 @@ def _origin(surveyed: Survey) -> str:
     return (
         f"Simulated, for unit {camera.unit_seed} of {title}, {frames}, the detector "
         f"{config.detector.name} at a threshold of {surveyed.task.criteria.threshold:.3g}. "
-        f"{surveyed.found.statement}"
+        f"{surveyed.findable.statement}"
     )
 
 
@@ -343,7 +343,7 @@ def _rows(
     """Return a row for each given pose and for each pose that is added, in order."""
     from harness.programs.coverage.statistics import in_turn
 
-    limits_mm = [surveyed.found.limits_mm(surveyed.seen[pose]) for pose in poses]
+    limits_mm = [surveyed.findable.limits_mm(surveyed.visibility[pose]) for pose in poses]
     found_patches = [limit_mm <= size_mm for limit_mm in limits_mm]
     turns = in_turn(surveyed.patches, found_patches, given_count, further_count)
     rows = list[dict[str, Any]]()
@@ -373,8 +373,8 @@ def _ways(surveyed: Survey, size_mm: float, share: float) -> list[dict[str, Any]
     ways = []
     frames = surveyed.point.config.capture.frames
     camera = camera_of(surveyed.point.config.simulated.camera)
-    for distance_m in dict.fromkeys(pose[0] for pose in surveyed.seen):
-        poses = [pose for pose in surveyed.seen if pose[0] == distance_m]
+    for distance_m in dict.fromkeys(pose[0] for pose in surveyed.visibility):
+        poses = [pose for pose in surveyed.visibility if pose[0] == distance_m]
         rows = _rows(surveyed, poses, size_mm, 0, MOST_POSES)
         needed = (row["number"] for row in rows if row["total_share"] >= share)
         rows = rows[: next(needed, len(rows))]

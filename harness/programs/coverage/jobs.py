@@ -61,9 +61,9 @@ class Survey:
     # The face of the part
     patches: Patches
     # The law of the signal
-    found: Findable
-    # The view of the patches, by pose
-    seen: dict[Pose, Seen]
+    findable: Findable
+    # How the patches are seen, by pose
+    visibility: dict[Pose, Seen]
 
 
 def survey(
@@ -120,7 +120,7 @@ def survey(
             seen_of_views = values_of(
                 _part_seen, [(view, task, group.seed, patches) for view in views], engine
             )
-            seen = {}
+            visibility = {}
             for pose, seen_of_view in zip(poses, seen_of_views, strict=True):
                 if seen_of_view is None:
                     seen_of_view = Seen(
@@ -129,9 +129,15 @@ def survey(
                         range_m=np.ones(len(blind)),
                         residual_m=np.zeros(len(blind)),
                     )
-                seen[pose] = seen_of_view
+                visibility[pose] = seen_of_view
             surveys.append(
-                Survey(point=point, task=task, patches=patches, found=findable_sizes, seen=seen)
+                Survey(
+                    point=point,
+                    task=task,
+                    patches=patches,
+                    findable=findable_sizes,
+                    visibility=visibility,
+                )
             )
     return surveys
 

@@ -284,7 +284,7 @@ class BoardView:
     # Names of the damages
     holes: tuple[str, ...]
     # Mask (h, w) of the judged pixels
-    known: np.ndarray
+    is_known: np.ndarray
     # Standard deviation (h, w) of the noise, metres
     deviation_m: np.ndarray
     # Signatures (n, h, w) of the damages, metres, 0 where nothing is judged
@@ -332,11 +332,11 @@ def ideal_damages(views: Sequence[BoardView], calls_per_m2: float) -> IdealDamag
     rows: list[tuple[int, str, float, float, float]] = []
     at_shares = []
     for view in views:
-        signals = view.signals_m / view.deviation_m * view.known
-        surface = view.surface / view.deviation_m * view.known
+        signals = view.signals_m / view.deviation_m * view.is_known
+        surface = view.surface / view.deviation_m * view.is_known
         is_seen = signals.any(axis=(1, 2))
         index = np.zeros(len(signals))
-        index[is_seen] = detectability(signals[is_seen], surface, view.known, sums)
+        index[is_seen] = detectability(signals[is_seen], surface, view.is_known, sums)
         for hole, signal, d in zip(view.holes, signals, index.tolist(), strict=True):
             if d == 0.0:
                 rows.append((view.board, hole, 0.0, np.nan, 0.0))

@@ -122,7 +122,7 @@ def board_views(batch: Batch, points: tuple[Point, ...]) -> dict[int, BoardView]
         view = BoardView(
             board=board,
             holes=names,
-            known=is_judged[cut],
+            is_known=is_judged[cut],
             deviation_m=deviation_m[cut],
             signals_m=shown_signals_m,
             surface=shown_surface,

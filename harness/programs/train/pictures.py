@@ -39,7 +39,7 @@ class LabelledPicture(NamedTuple):
     """Number of the board."""
     whitened: np.ndarray
     """(r, c) float32: whitened residuals."""
-    known: np.ndarray
+    is_known: np.ndarray
     """(r, c) bool."""
     damage: np.ndarray
     """(r, c) bool: on damage."""
@@ -108,6 +108,6 @@ def prior_of(pictures: Sequence[LabelledPicture]) -> float:
 def example_of(picture: LabelledPicture, sign: float) -> Example:
     """Return a picture as a network is to see it, its residuals times a sign: damage behind the
     surface is none to a network that looks for it in front."""
-    pictures = seen_by_network(picture.whitened, picture.known, sign)
+    pictures = seen_by_network(picture.whitened, picture.is_known, sign)
     damage = picture.damage * np.float32(sign > 0)
     return Example(pictures, damage, picture.weights)

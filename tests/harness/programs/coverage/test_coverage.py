@@ -278,7 +278,7 @@ def test_limits_of_ten_patches_agree_with_full_studies(tmp_path: Path) -> None:
     cache = tmp_path / "renders"
     with engine_of(EngineOptions(jobs=2)) as local:
         (survey,) = engine.survey(experiment, [(0.7, 0.0, 0.0)], cache, tmp_path, local)
-    limits_mm = survey.found.limits_mm(survey.seen[0.7, 0.0, 0.0])
+    limits_mm = survey.findable.limits_mm(survey.visibility[0.7, 0.0, 0.0])
     studied = studied_mm(survey, 48, cache)
     predicted = []
     for position in studied:

@@ -87,10 +87,10 @@ def test_pictures_show_each_board_before_each_unit_with_its_damage(pictures):
         on_damage = picture.weights[picture.damage]
         assert on_damage.sum() == pytest.approx(2 * DAMAGE_PIXELS, rel=1e-5)
         assert np.median(picture.whitened[picture.damage]) > 1.0
-        ring = (picture.weights == 0) & picture.known
+        ring = (picture.weights == 0) & picture.is_known
         assert ring.any()
         assert not (ring & picture.damage).any()
-        assert (picture.weights[~picture.known] == 0).all()
+        assert (picture.weights[~picture.is_known] == 0).all()
 
 
 def test_the_prior_counts_every_picture_with_both_signs(pictures):
