@@ -261,15 +261,8 @@ def worths(power: np.ndarray, window_px: int) -> tuple[Worth, ...]:
         side = len(white)
         whitened = sums.squares @ (sums.weights * np.square(white).ravel()).T
         energy, row_moment, column_moment = whitened.T
-        # Parseval's theorem: a second moment over space is the energy of a derivative over
-        # frequency
-        pairs_above = (white * np.roll(white, 1, axis=0)).ravel()
-        pairs_right = (white * np.roll(white, -1, axis=1)).ravel()
-        spread_down = 2.0 * (energy - sums.above @ pairs_above)
-        spread_across = 2.0 * (energy - sums.right @ pairs_right)
-        spread = np.stack([spread_across, spread_down], axis=1)
-        reach = np.sqrt(3.0 * spread / energy[:, None]) * side / (2.0 * math.pi)
-        nearest = np.abs(np.array(SIDES_PX) - reach[..., None]).argmin(axis=2)
+        reach_px = _reach_px(sums, white, energy)
+        nearest = np.abs(np.array(SIDES_PX) - reach_px[..., None]).argmin(axis=2)
         half_sides = np.array(SIDES_PX)[nearest]
         energies += [value / GRID**2 for value in energy.tolist()]
         sides += [(2 * across + 1, 2 * down + 1) for across, down in half_sides.tolist()]
@@ -357,3 +350,17 @@ def window_of(covariance: np.ndarray) -> int:
         return float(by_lag[side - 1] - 2.0 * by_lag[side] + by_lag[side + 1])
 
     return max(WINDOWS_PX[1:], key=bend)
+
+
+def _reach_px(sums: _SpectrumSums, white: np.ndarray, energy: np.ndarray) -> np.ndarray:
+    """Return how far each template's whitened energy (t,) reaches across and down (t, 2): half of
+    the sides of the rectangle with the same second moments. ``white`` (k, k): the spectrum of the
+    whitening.
+
+    Parseval's theorem: a second moment over space is the energy of a derivative over frequency."""
+    pairs_above = (white * np.roll(white, 1, axis=0)).ravel()
+    pairs_right = (white * np.roll(white, -1, axis=1)).ravel()
+    spread_down = 2.0 * (energy - sums.above @ pairs_above)
+    spread_across = 2.0 * (energy - sums.right @ pairs_right)
+    spread = np.stack([spread_across, spread_down], axis=1)
+    return np.asarray(np.sqrt(3.0 * spread / energy[:, None]) * len(white) / (2.0 * math.pi))
