@@ -221,7 +221,8 @@ def test_changes_beyond_the_usual_count() -> None:
 
 def test_the_clipped_mean_allows_sigmas_of_the_frame_or_of_the_pixel() -> None:
     stack = noisy(5, (60, 80), sigma_m=1e-3)
-    stack.z_m[:, 0, 0] = np.float32(0.8) + np.float32(0.05) * np.array([-1, -0.5, 0, 0.5, 1], "f4")
+    # a pixel whose median deviation is 25 mm
+    stack.z_m[:, 0, 0] = np.array([0.75, 0.775, 0.8, 0.825, 0.85], np.float32)
     config = AverageConfig(method="clipped", changed_mm=200.0)
     gate = FrameSums(stack, list(stack.frames()), config).gate.reshape(60, 80)
     assert gate[0, 0] == pytest.approx(5.0 * 0.025 / 0.6745, rel=1e-4)

@@ -323,9 +323,12 @@ def test_a_change_of_the_pattern_is_that_of_the_means() -> None:
     values = np.nan_to_num(patterns)
     common = np.ones((6, 7), bool)
     common[5, 6] = False
-    first = ((values * weights)[:2].sum(axis=0) / weights[:2].sum(axis=0))[common]
-    second = ((values * weights)[2:].sum(axis=0)[common]) / weights[2:].sum(axis=0)[common]
-    noise = (1 / weights[:2].sum(axis=0))[common] + 1 / weights[2:].sum(axis=0)[common]
+    weighted = values * weights
+    first_weight = weights[:2].sum(axis=0)[common]
+    second_weight = weights[2:].sum(axis=0)[common]
+    first = weighted[:2].sum(axis=0)[common] / first_weight
+    second = weighted[2:].sum(axis=0)[common] / second_weight
+    noise = 1 / first_weight + 1 / second_weight
     assert change.difference_m == pytest.approx(np.sqrt(np.mean((first - second) ** 2)))
     assert change.noise_m == pytest.approx(np.sqrt(np.mean(noise)))
     assert change.correlation == pytest.approx(np.corrcoef(first, second)[0, 1])
@@ -336,7 +339,7 @@ def test_a_change_of_the_pattern_is_that_of_the_means() -> None:
     assert _change(patterns, variances, [2], []) is None
     for pixels, is_known in ((1, False), (2, True)):
         sparse = np.full((2, 6, 7), np.nan)
-        sparse[:, 0, :pixels] = [[[1.0, 2.0]], [[3.0, 5.0]]][0][0][:pixels]
+        sparse[:, 0, :pixels] = [1.0, 2.0][:pixels]
         assert (_change(sparse, variances, [0], [1]) is not None) == is_known
 
 

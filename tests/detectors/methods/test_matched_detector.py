@@ -348,8 +348,10 @@ def test_the_errors_of_an_edge_are_no_damage(learns: bool) -> None:
 
 def test_local_means_count_the_errors_of_an_edge_as_noise(monkeypatch) -> None:
     local = LocalDetector(LocalDetector.settings_type.from_data({"crop": {"kind": "none"}}))
-    clouds = [cloud_of(3e-4 * (smooth(seed) + 2.0 * stepped(seed))) for seed in range(30, 34)]
-    plain = [rim_peak(local.analyse(cloud_of(3e-4 * smooth(seed)))) for seed in range(30, 34)]
+    seeds = range(30, 34)
+    bare = [cloud_of(3e-4 * smooth(seed)) for seed in seeds]
+    clouds = [cloud_of(3e-4 * (smooth(seed) + 2.0 * stepped(seed))) for seed in seeds]
+    plain = [rim_peak(local.analyse(cloud)) for cloud in bare]
     aware = [rim_peak(local.analyse(cloud)) for cloud in clouds]
     monkeypatch.setattr(local_methods, "_rim_variances", lambda noise, seen, reach_px: 0.0 * noise)
     misled = [rim_peak(local.analyse(cloud)) for cloud in clouds]

@@ -77,12 +77,13 @@ def test_slopes_and_pixels_are_inverse(lens: Lens) -> None:
     u = np.array([[10.0, 320.5, 600.0], [100.0, 200.0, 500.0]])
     v = np.array([[300.0, 240.0, 20.0], [400.0, 100.25, 350.0]])
     slopes = lens.slopes(u, v)
-    points = (
-        np.concatenate([slopes, np.ones((2, 3, 1))], axis=-1) * np.array([0.5, 1.0, 3.0])[:, None]
-    )
+    rays = np.concatenate([slopes, np.ones((2, 3, 1))], axis=-1)
+    z_m = np.array([0.5, 1.0, 3.0])
+    points = rays * z_m[:, None]
     assert lens.project(points) == pytest.approx(np.stack([u, v], axis=-1), abs=1e-4)
+    unmoved = np.zeros(3)
     by_cv, _ = cv2.projectPoints(
-        points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion)
+        points.reshape(-1, 1, 3), unmoved, unmoved, lens.matrix, np.array(lens.distortion)
     )
     assert lens.project(points).reshape(-1, 2) == pytest.approx(by_cv[:, 0])
 

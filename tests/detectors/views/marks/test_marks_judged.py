@@ -324,7 +324,8 @@ def test_uneven_light_is_taken_out_of_the_colours(slope) -> None:
     colours = np.where(group[..., None], [50.0, 90.0, 20.0], [100.0, 80.0, 40.0])
     light = 1.0 + slope[0] * (U - 70.0) / 100.0 + slope[1] * (V - 60.0) / 100.0
     window = np.s_[20:120, 10:150]
-    even = _evenly_lit((colours * light[..., None])[window], ring[window], group[window])
+    lit = colours * light[..., None]
+    even = _evenly_lit(lit[window], ring[window], group[window])
     blob = within(70.0, 60.0, 61, 41)[window]
     np.testing.assert_allclose(even[blob], colours[window][blob], rtol=1e-9)
 

@@ -115,8 +115,10 @@ def test_the_plane_under_a_mark_survives_a_hole_beside_it():
 
 
 def test_rays_meet_the_plane_along_themselves():
-    grid = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2) * 0.01
-    patch = fit_patch(np.column_stack([grid, 0.5 + 0.1 * grid[:, 0]]))
+    ticks_m = [-0.01, 0.0, 0.01]
+    x_m, y_m = np.meshgrid(ticks_m, ticks_m)
+    z_m = 0.5 + 0.1 * x_m
+    patch = fit_patch(np.column_stack([x_m.ravel(), y_m.ravel(), z_m.ravel()]))
     assert patch is not None
     point = np.array([[0.02, -0.01, 0.6]])
     central = patch.cut(point, "central")

@@ -188,8 +188,10 @@ def test_signals_are_compared_over_the_threshold_with_boards_as_units() -> None:
 
 def test_a_damage_counts_if_the_mean_of_both_signals_exceeds_the_threshold() -> None:
     """Geometric means over the threshold of 1.1, 0.9, 1.1, 1.1 and 1.1; the thresholds differ."""
-    before = 4.0 * np.array([1.1, 0.9, 1.1, 1.1, 1.1]) * np.exp([-0.2, -0.2, -0.2, 0.1, 0.1])
-    now = 6.0 * np.array([1.1, 0.9, 1.1, 1.1, 1.1]) * np.exp([0.2, 0.2, 0.2, -0.1, -0.1])
+    means = np.array([1.1, 0.9, 1.1, 1.1, 1.1])
+    half_changes = np.array([0.2, 0.2, 0.2, -0.1, -0.1])
+    before = 4.0 * means * np.exp(-half_changes)
+    now = 6.0 * means * np.exp(half_changes)
     change = signal_change(signals(4.0, before.tolist()), signals(6.0, now.tolist()))
     assert change is not None
     assert change.damages == 4
