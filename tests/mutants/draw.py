@@ -37,6 +37,7 @@ NOT_NUMERIC = (
     "detectors/recordings/opening.py",
     "harness/inspection/arguments.py",
     "harness/inspection/output.py",
+    "harness/inspection/presentation.py",
     "harness/programs/dataset/exchange.py",
     "harness/programs/keeping/*",
     "scenes/render/cache.py",
