@@ -16,7 +16,7 @@ from detectors.crop import (
     CropConfig,
     NoCrop,
     PolygonCrop,
-    _Comparison,
+    _OutlineComparison,
     choice_of,
     crop,
 )
@@ -138,15 +138,15 @@ def test_the_wall_can_be_asked_for_and_is_taken_without_the_board() -> None:
     assert "--target 2: 1.20 m" in str(caught.value)
 
 
-def compared(z_m: np.ndarray) -> _Comparison:
+def compared(z_m: np.ndarray) -> _OutlineComparison:
     """The surfaces of a picture of two, the nearer one first."""
     cloud = cloud_of(z_m + 3e-4 * np.random.default_rng(0).standard_normal(z_m.shape))
-    comparison = _Comparison(smooth_surfaces(cloud, 35.0, 9), cloud)
+    comparison = _OutlineComparison(smooth_surfaces(cloud, 35.0, 9), cloud)
     assert len(comparison.numbers) == 2
     return comparison
 
 
-def nearer_first(comparison: _Comparison) -> list[int]:
+def nearer_first(comparison: _OutlineComparison) -> list[int]:
     return sorted(comparison.numbers, key=lambda number: comparison.described[number].depths_m[1])
 
 

@@ -81,7 +81,7 @@ def test_a_score_is_the_root_of_twice_the_logarithm_of_the_likelihood_ratio(tmp_
     cloud = damaged()
     evidence = detector.analyse(cloud)
     whitened = detector.whitened(*detector.picture(cloud).residuals)
-    inputs = seen_by_network(whitened.values, whitened.known, 1.0)[0]
+    inputs = seen_by_network(whitened.values, whitened.is_known, 1.0)[0]
     row, column = 42, 52
     log_ratio = float(inputs[row - 1 : row + 2, column - 1 : column + 2].sum())
     expected = np.sqrt(2 * np.log1p(np.exp(log_ratio)))
