@@ -26,7 +26,7 @@ Not modelled: slots within `RIM_PX` of outlines and of removed findings; distort
 steep surfaces; missing returns, except the few that are not findings by themselves
 (`detectors.findings.missing`). The denominator takes the share of a
 template's whitened energy on known pixels for t' C^-1 t, by a rectangle that spreads as widely; a
-template does not judge pixels where less than `LEAST_SEEN` of it is visible."""
+template does not judge pixels where less than `template_scores.LEAST_SEEN` of it is visible."""
 
 from __future__ import annotations
 
