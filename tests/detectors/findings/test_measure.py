@@ -1,5 +1,4 @@
-"""Measurements: extents by hand, the blurred disc against brute force, standard errors against
-simulation."""
+"""Measurements: the blurred disc against brute force, standard errors against simulation."""
 
 from __future__ import annotations
 
@@ -33,24 +32,6 @@ PLAIN = HoleModelConfig(lens_px=0.0, linear_depth_mm=1e5)
 """A sharp lens before a filter that weighs all pixels alike."""
 MIDDLE = (250.0, 120.0)
 """Principal point (u, v) on the sensor."""
-
-
-def test_extents_of_a_hand_made_cluster() -> None:
-    points = np.array(
-        [[0.0, 0.1, 1.0], [0.3, 0.1, 1.4], [0.1, 0.0, 1.0], [0.1, 0.2, 1.0], [0.15, 0.1, 1.0]]
-    )
-    diameter, centre = extents(points)
-    # in x: 0.3 across and 0.4 deep make 0.5; in y: 0.2
-    assert diameter == pytest.approx(0.35, abs=1e-15)
-    np.testing.assert_allclose(centre, [0.125, 0.1, 1.1], atol=1e-15)
-
-
-def test_of_equal_extremes_the_first_counts() -> None:
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 2.0], [1.0, 0.5, 1.0], [1.0, 0.0, 3.0]])
-    diameter, _ = extents(points)
-    west_east = np.hypot(1.0, 0.5)
-    north_south = np.hypot(0.5, 1.0)
-    assert diameter == pytest.approx((west_east + north_south) / 2, abs=1e-15)
 
 
 def brute_disc(
