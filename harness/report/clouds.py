@@ -196,7 +196,9 @@ def _panel(example: StudyExample, norm: SymLogNorm, titles: Mapping[Where, str])
     for text, offset_px in (("−10", -step_px), ("0", 0.0), ("10 mm", step_px)):
         ticks.append((round(scale * (width / 2 + offset_px), 1), text))
     rows, columns = np.nonzero(example.detected)
-    dots = [f"M{column + 0.5} {row + 0.5}h.01" for row, column in zip(rows, columns, strict=True)]
+    marks = []
+    for row, column in zip(rows, columns, strict=True):
+        marks.append(f"M{column + 0.3:.1f} {row + 0.3:.1f}h.4v.4h-.4z")
     rim = [f"{u + 0.5:.2f} {v + 0.5:.2f}" for u, v in example.outline_px]
     pod = f", POD {example.pod:.2f}" if np.isfinite(example.pod) else ""
     return {
@@ -205,7 +207,7 @@ def _panel(example: StudyExample, norm: SymLogNorm, titles: Mapping[Where, str])
         "scale": round(scale, 3),
         "pixels": (width, height),
         "image": data_url(residual_rgb(example.residual_mm, norm)),
-        "found": "".join(dots),
+        "found": "".join(marks),
         "rim": f"M{'L'.join(rim)}Z",
         "ticks": ticks,
         "outcome": _outcome(example).split(", "),

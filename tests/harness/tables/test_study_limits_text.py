@@ -15,6 +15,7 @@ from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.result import FRAMES, SetUpResult, StudyResult, axis_lines
 from harness.records.examples import StudyExample
 from harness.records.schema import Estimate
+from harness.report.blocks import DAMAGE
 from harness.report.clouds import examples_figure
 from harness.report.study_figures import MOST_CURVES, axis_figure, overlay_figure, with_room
 from harness.report.study_page import study_parts
@@ -430,3 +431,15 @@ def test_examples_say_what_came_of_them() -> None:
     without = examples_figure("examples-1", [missed, example()], "1 frame", by_limit=False)
     assert "6.2 mm, smaller, missed" in without
     assert "the limit" not in without
+
+
+def test_each_pixel_of_a_finding_is_a_filled_mark() -> None:
+    """Filled, since matplotlib's drawings set the ends of strokes on the whole page."""
+    shown = example()
+    figure = examples_figure("examples-1", [shown], "1 frame")
+    marks = re.search(rf'<path d="([^"]*)" fill="{DAMAGE}"/>', figure)
+    assert marks is not None
+    places = re.findall(r"M([\d.]+) ([\d.]+)h\.4v\.4h-\.4z", marks.group(1))
+    rows, columns = np.nonzero(shown.detected)
+    expected = np.column_stack([columns, rows]) + 0.3
+    np.testing.assert_allclose(np.array(places, float), expected)
