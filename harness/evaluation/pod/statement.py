@@ -7,7 +7,7 @@ from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from threadpoolctl import ThreadpoolController
 
 from harness.evaluation.pod import hit_miss
@@ -405,7 +405,7 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
     calls = int((sites > decision).sum())
     upper = 1.0
     if calls < len(sites):
-        upper = float(stats.beta.ppf(CONFIDENCE, calls + 1, len(sites) - calls))
+        upper = float(special.betaincinv(calls + 1, len(sites) - calls, CONFIDENCE))
     numbers = {
         "unflawed sites": float(len(sites)),
         "false positives": float(calls),
@@ -421,6 +421,8 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
 def _false_positives_by_noise(sites: np.ndarray, fit: AhatFit) -> float | None:
     """Return the probability that a normal law of the ``sites``' noise exceeds the decision; None
     if there are too few to fit it, or some have no logarithm."""
+    from scipy import stats
+
     if fit.log_signal and not (sites > 0).all():
         return None
     limit = -np.inf if fit.left is None else fit.left
