@@ -30,7 +30,12 @@ from typing import IO, Any
 
 from harness.runs.jobs import TRACEBACK_CHARACTERS, Code, Ended, Job, Limits, Stage, attempt
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.provenance import first_content, reached_sources, source_digest
+from harness.vocabulary.provenance import (
+    first_content,
+    imported_sources,
+    reached_sources,
+    source_digest,
+)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 """Each process uses one thread, so that sums are taken in the same order on every machine and
@@ -110,7 +115,7 @@ def _forked(path: bytes, arguments: Sequence[Any], kept_files: Sequence[int]) ->
         for first, last in pairwise([2, *sorted(kept_files), MOST_FILES]):
             os.closerange(first + 1, last)
         # as in a new process: its forks see sources as they are when they start
-        for known in (source_digest, reached_sources, first_content):
+        for known in (source_digest, reached_sources, imported_sources, first_content):
             known.cache_clear()
         exec(arguments[-1], {})
     except Exception:

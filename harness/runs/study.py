@@ -45,6 +45,7 @@ from harness.runs.shards import Shard, locked
 from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of, write_tables
 from harness.tables.study import study_tables
+from harness.vocabulary.code_digests import remembered
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
     RECORD_BYTES,
@@ -72,7 +73,6 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     bill.begin("plan")
     # recorded now: a commit during the sweep does not change the code that runs
     origin = record(command)
-    origin["digests"] = experiment_digests(experiment)
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder = experiment.folder(out)
     cache = out / ".cache" / "renders"
@@ -86,6 +86,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         plan = batches.first()
         # the first file written shows whether the folder is writable, before any work
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
+        with remembered(out / ".cache" / "sources.json"):
+            origin["digests"] = experiment_digests(experiment)
         with (
             in_use(cache),
             locked(folder, options.shard),
