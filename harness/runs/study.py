@@ -88,10 +88,11 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
         with remembered(out / ".cache" / "sources.json"):
             origin["digests"] = experiment_digests(experiment)
+        renders = any(not render.path.exists() for render in plan.renders)
         with (
             in_use(cache),
             locked(folder, options.shard),
-            Metered(engine_of(options, detectors, cache), bill) as engine,
+            Metered(engine_of(options, detectors, cache, renders=renders), bill) as engine,
         ):
             bill.begin("detection")
             with progress_display() as report:
