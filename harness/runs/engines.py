@@ -17,16 +17,20 @@ a room of its own."""
 
 
 def engine_of(
-    options: EngineOptions, detectors: Iterable[str] = (), folder: Path = Path()
+    options: EngineOptions,
+    detectors: Iterable[str] = (),
+    folder: Path = Path(),
+    *,
+    renders: bool = True,
 ) -> JobEngine:
-    """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders.
-    Raises UserError."""
+    """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders;
+    ``renders``: whether any are to be expected. Raises UserError."""
     from harness.runs.processes import LocalEngine, SerialEngine
 
     if options.serial:
         return SerialEngine()
     if options.scheduler is None:
-        return LocalEngine(options.jobs, options.limits, code_of(detectors))
+        return LocalEngine(options.jobs, options.limits, code_of(detectors), renders=renders)
     module_name, _, class_name = CLUSTER.partition(":")
     cluster_engine = getattr(import_module(module_name), class_name)
     engine: JobEngine = cluster_engine(

@@ -30,7 +30,12 @@ from typing import IO, Any
 
 from harness.runs.jobs import TRACEBACK_CHARACTERS, Code, Ended, Job, Limits, Stage, attempt
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.provenance import first_content, reached_sources, source_digest
+from harness.vocabulary.provenance import (
+    first_content,
+    imported_sources,
+    reached_sources,
+    source_digest,
+)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 """Each process uses one thread, so that sums are taken in the same order on every machine and
@@ -54,9 +59,9 @@ CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
 """Processes fork from a small server process that has imported what each of them would need a
 second to import."""
-PRELOADED = ("harness.trials.trial", "scenes.render.view")
-if CAN_FORK:
-    PROCESSES.set_forkserver_preload(list(PRELOADED))
+TRIALS = "harness.trials.trial"
+RENDERS = "scenes.render.view"
+"""What processes for trials and for renders need; the latter loads SciPy's statistics."""
 NOT_TO_FORK = ("drjit", "open3d")
 """Packages that a process must load in their order (`scenes.render.scene`), and by itself."""
 
@@ -64,19 +69,21 @@ SAFE_THREADS = ("jemalloc_bg_thd",)
 """Threads that prepare their locks for a fork: that of PyArrow's allocator."""
 
 
-def start_server() -> None:
-    """Start the server process, unless it runs. If it is safe, it is a fork of this process, which
-    saves the 1.5 s of processor time in which another interpreter imports the same modules."""
+def start_server(preloaded: Sequence[str]) -> None:
+    """Start the server process with these modules, unless it runs. If it is safe, it is a fork of
+    this process, which saves the 1.5 s of processor time in which another interpreter imports the
+    same modules."""
     if not CAN_FORK:
         return
     from multiprocessing import forkserver, resource_tracker
 
     util: Any = importlib.import_module("multiprocessing.util")
     with _starting():
+        PROCESSES.set_forkserver_preload(list(preloaded))
         if not _is_safe_to_fork():
             forkserver.ensure_running()
             return
-        for module in PRELOADED:
+        for module in preloaded:
             importlib.import_module(module)
         resource_tracker.ensure_running()
         spawned = util.spawnv_passfds
@@ -110,7 +117,7 @@ def _forked(path: bytes, arguments: Sequence[Any], kept_files: Sequence[int]) ->
         for first, last in pairwise([2, *sorted(kept_files), MOST_FILES]):
             os.closerange(first + 1, last)
         # as in a new process: its forks see sources as they are when they start
-        for known in (source_digest, reached_sources, first_content):
+        for known in (source_digest, reached_sources, imported_sources, first_content):
             known.cache_clear()
         exec(arguments[-1], {})
     except Exception:
@@ -134,14 +141,23 @@ class LocalEngine:
     """Runs jobs in ``jobs`` processes for trials and up to two for renders, which load Mitsuba.
     ``limits`` hold for trials; renders have no memory limit, because Dr.Jit reserves more than it
     uses. ``code``: modules that determine a stage's results. A process that starts after an edit
-    of their sources is refused: its results would differ."""
+    of their sources is refused: its results would differ. ``renders``: whether any are to be
+    expected; if not, their modules are loaded only when one comes."""
 
-    def __init__(self, jobs: int, limits: Limits, code: Mapping[Stage, Code] | None = None) -> None:
+    def __init__(
+        self,
+        jobs: int,
+        limits: Limits,
+        code: Mapping[Stage, Code] | None = None,
+        *,
+        renders: bool = True,
+    ) -> None:
         self.code = dict(code or {})
         self.digests = {stage: source_digest(*code) for stage, code in self.code.items()}
         self.false_starts = 0
         self.is_over = False
         self.trace_files: tempfile.TemporaryDirectory[str]
+        self._preloaded = (TRIALS, RENDERS) if renders else (TRIALS,)
         self._limits = limits
         self._most: dict[Stage, int] = {"trials": jobs, "renders": min(jobs, MOST_RENDERERS)}
         self._waiting: dict[Stage, deque[tuple[Job, Limits, Answers]]] = {
@@ -154,7 +170,7 @@ class LocalEngine:
         self._out: Counter[Stage] = Counter()
 
     def __enter__(self) -> LocalEngine:
-        start_server()
+        start_server(self._preloaded)
         self.trace_files = tempfile.TemporaryDirectory(prefix="tofpod-", ignore_cleanup_errors=True)
         return self
 

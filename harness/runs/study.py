@@ -45,6 +45,7 @@ from harness.runs.shards import Shard, locked
 from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of, write_tables
 from harness.tables.study import study_tables
+from harness.vocabulary.code_digests import remembered
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
     RECORD_BYTES,
@@ -72,7 +73,6 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     bill.begin("plan")
     # recorded now: a commit during the sweep does not change the code that runs
     origin = record(command)
-    origin["digests"] = experiment_digests(experiment)
     origin["started"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     folder = experiment.folder(out)
     cache = out / ".cache" / "renders"
@@ -86,10 +86,13 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         plan = batches.first()
         # the first file written shows whether the folder is writable, before any work
         write_text(folder / EXPERIMENT.name, resolved_yaml(experiment))
+        with remembered(out / ".cache" / "sources.json"):
+            origin["digests"] = experiment_digests(experiment)
+        renders = any(not render.path.exists() for render in plan.renders)
         with (
             in_use(cache),
             locked(folder, options.shard),
-            Metered(engine_of(options, detectors, cache), bill) as engine,
+            Metered(engine_of(options, detectors, cache, renders=renders), bill) as engine,
         ):
             bill.begin("detection")
             with progress_display() as report:

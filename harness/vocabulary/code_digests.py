@@ -6,7 +6,9 @@ nor do the versions of packages, which `requirements.lock` fixes and `provenance
 
 import ast
 import hashlib
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from harness.vocabulary import provenance
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json, write_json
 from harness.vocabulary.seeds import digest
 
 COUNTED = (
@@ -36,6 +40,25 @@ NOT_SYNTAX = ("ctx", "kind", "type_comment")
 DIGITS = 12
 Digests = dict[str, str]
 """Digests by part: a room, a camera, an experiment or a file."""
+_known: Digests = {}
+"""Digests of sources by that of their bytes."""
+
+
+@contextmanager
+def remembered(path: Path) -> Iterator[None]:
+    """Take the digests of sources that an earlier process has kept in a file, and keep those of
+    this one: to parse what a study hangs on takes half a second. A file that another version of
+    this code or of Python wrote, or that cannot be read or written, does not count."""
+    by = f"{sys.version_info[:2]} {_content_digest(Path(__file__))}"
+    with suppress(OSError, ValueError, UserError, KeyError, TypeError):
+        stored = strict_json(bounded_bytes(path, TEXT_BYTES))
+        if stored["by"] == by:
+            _known.update(stored["digests"])
+    before = len(_known)
+    yield
+    if len(_known) > before:
+        with suppress(UserError):
+            write_json(path, {"by": by, "digests": _known})
 
 
 def code_digests(modules: Iterable[str]) -> Digests:
@@ -110,10 +133,19 @@ def _file_digest(path: Path) -> str:
 def _syntax_digest(path: Path) -> str:
     """Return the digest of a Python source, as this process first read it: what a process makes
     comes from the code that it runs."""
-    tree = ast.parse(provenance.first_content(path))
-    words: list[str] = []
-    _add_syntax(tree, words)
-    return hashlib.blake2b(" ".join(words).encode()).hexdigest()[:DIGITS]
+    content_digest = _content_digest(path)
+    if content_digest not in _known:
+        tree = ast.parse(provenance.first_content(path))
+        words: list[str] = []
+        _add_syntax(tree, words)
+        syntax_digest = hashlib.blake2b(" ".join(words).encode()).hexdigest()
+        _known[content_digest] = syntax_digest[:DIGITS]
+    return _known[content_digest]
+
+
+def _content_digest(path: Path) -> str:
+    """Return the digest of a source's bytes, as this process first read it."""
+    return hashlib.blake2b(provenance.first_content(path), digest_size=16).hexdigest()
 
 
 def _add_syntax(node: Any, words: list[str]) -> None:

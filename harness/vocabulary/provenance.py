@@ -185,16 +185,34 @@ def reached_sources(modules: tuple[str, ...]) -> tuple[Path, ...]:
     functions and for type checking. A module that is loaded by a name in a variable is not seen:
     list it in ``modules``."""
     paths: dict[str, Path] = {}
-    waiting = list(modules)
+    waiting = list(_sources_of(modules))
     while waiting:
-        name = waiting.pop()
-        path = None if name in paths else _source_of(name)
-        if path is None:
+        name, path = waiting.pop()
+        if name in paths:
             continue
         paths[name] = path
-        waiting.append(name.rpartition(".")[0])  # a package's own code runs before its modules
-        waiting += _imported(first_content(path).decode())
+        package = name.rpartition(".")[0]
+        if package not in paths:  # a package's own code runs before its modules
+            waiting += _sources_of((package,))
+        waiting += imported_sources(path)
     return tuple(sorted(paths.values()))
+
+
+@cache
+def imported_sources(path: Path) -> tuple[tuple[str, Path], ...]:
+    """Return name and file of each module of the project that a source imports, as this process
+    first read it."""
+    return _sources_of(dict.fromkeys(_imported(first_content(path).decode())))
+
+
+def _sources_of(names: Iterable[str]) -> tuple[tuple[str, Path], ...]:
+    """Return name and file of those of the names that are modules of the project."""
+    sources = []
+    for name in names:
+        path = _source_of(name)
+        if path is not None:
+            sources.append((name, path))
+    return tuple(sources)
 
 
 @cache

@@ -78,7 +78,7 @@ class SimulatedUnit:
             return None
         wanted = np.zeros(self.view.range_m.shape, bool)
         wanted[self.cut] = True
-        return first_order(self.model, self.exposure, wanted)
+        return first_order(self.model, self.exposure, wanted, self.jitter_mm)
 
     @cached_property
     def region(self) -> Region:

@@ -3,20 +3,31 @@
 Runs each shipped experiment, or the named ones, three times with two processes: from nothing; with
 its renders stored, but no trials; and with everything stored. Prints a table of the processor
 seconds that each run bills itself (`harness.runs.bill`), a row as soon as it is known, and the
-minutes of the first run by the wall clock. Run it on an idle machine; all takes some two hours,
-``--quick`` some fifteen minutes. ``--read`` runs nothing: it prints the bills of the newest runs in
-DIR.
+minutes of the first run by the wall clock; and writes it to ``DIR/jobs.csv``. Run it on an idle
+machine; all takes some two hours, ``--quick`` some fifteen minutes.
+
+``--checkout`` runs the code of another checkout, and ``--before DIR`` sets what was measured there
+beside it:
+
+    python tests/benchmarks/jobs.py --checkout ../older --out results/costs/before averaging
+    python tests/benchmarks/jobs.py --before results/costs/before averaging
+
+``--read DIR`` runs nothing: it prints the bills of the newest runs in a folder of results.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
+import os
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,30 +36,81 @@ sys.path.insert(0, str(ROOT))
 
 from harness.records.outputs import PROVENANCE
 from harness.runs.bill import BILL, FIXED
+from harness.vocabulary.files import write_text
 
-BILLED = ("experiment", "views", "trials", "from nothing (s)", "of it fixed (s)")
-MEASURED = ("from nothing (min)", "renders stored (s)", "all stored (s)")
+TABLE = "jobs.csv"
+TRAINED_ON = "training"
+"""An experiment that `tofpod train` uses, and nobody sweeps."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one experiment costs; None where it was not measured. Seconds are of all processors."""
+
+    experiment: str
+    """Its name."""
+    views: int | None = None
+    """Views that were rendered."""
+    trials: int | None = None
+    """Trials that were run."""
+    before_s: float | None = None
+    """From nothing, as another measurement found it."""
+    from_nothing_s: float | None = None
+    """From nothing."""
+    fixed_s: float | None = None
+    """Of that, what depends on neither views nor trials."""
+    from_nothing_min: float | None = None
+    """The same run by the wall clock."""
+    renders_stored_s: float | None = None
+    """With renders stored, but no trials."""
+    all_stored_s: float | None = None
+    """With everything stored."""
+
+
+HEADS = {
+    "experiment": "experiment",
+    "views": "views",
+    "trials": "trials",
+    "before_s": "before (s)",
+    "from_nothing_s": "from nothing (s)",
+    "fixed_s": "of it fixed (s)",
+    "from_nothing_min": "from nothing (min)",
+    "renders_stored_s": "renders stored (s)",
+    "all_stored_s": "all stored (s)",
+}
 
 
 def main() -> None:
     """Run the experiments, or read their bills, and print the table."""
-    shipped = [path.stem for path in sorted((ROOT / "experiments").glob("*.yaml"))]
+    names = [path.stem for path in sorted((ROOT / "experiments").glob("*.yaml"))]
+    shipped = [name for name in names if name != TRAINED_ON]
     parser = argparse.ArgumentParser(description="Print what whole experiments cost.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="default: all that are shipped")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "costs", metavar="DIR")
     parser.add_argument("--quick", action="store_true", help="the first look of each")
-    parser.add_argument("--read", action="store_true", help="run nothing; read bills in DIR")
+    parser.add_argument("--checkout", type=Path, default=ROOT, metavar="DIR", help="whose code")
+    parser.add_argument("--before", type=Path, metavar="DIR", help="--out of another measurement")
+    parser.add_argument("--read", type=Path, metavar="DIR", help="print bills in DIR, run nothing")
     options = parser.parse_args()
-    columns = list(BILLED)
-    if not options.read:
-        columns += MEASURED
-    print_row(columns)
-    print_row(["---"] * len(columns))
+    before = {} if options.before is None else seconds_before(options.before)
+    print_row(list(HEADS.values()))
+    print_row(["---"] * len(HEADS))
+    rows = []
     for name in options.names or shipped:
-        if options.read:
-            print_row(row_of_bill(options.out, name))
+        if options.read is not None:
+            row = row_of_bill(options.read, name, before.get(name))
         else:
-            print_row(measured_row(options.out / name, name, quick=options.quick))
+            row = measured_row(
+                options.out.absolute() / name,
+                name,
+                checkout=options.checkout,
+                quick=options.quick,
+                before_s=before.get(name),
+            )
+        print_row([cell_text(getattr(row, field)) for field in HEADS])
+        rows.append(row)
+        if options.read is None:
+            write_table(options.out / TABLE, rows)
 
 
 def print_row(cells: Sequence[str]) -> None:
@@ -56,29 +118,71 @@ def print_row(cells: Sequence[str]) -> None:
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def measured_row(out: Path, name: str, *, quick: bool) -> list[str]:
+def cell_text(value: str | float | None) -> str:
+    """Return a cell of the printed table: minutes and short times with a decimal."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.1f}" if value < 20 else f"{value:.0f}"
+    return str(value)
+
+
+def write_table(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows measured so far as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = [field.name for field in fields(Row)]
+    writer.writerow(names)
+    for row in rows:
+        writer.writerow([getattr(row, name) for name in names])
+    write_text(path, text.getvalue())
+
+
+def seconds_before(folder: Path) -> dict[str, float]:
+    """Return the seconds from nothing by experiment, as another measurement wrote them."""
+    with (folder / TABLE).open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    return {row["experiment"]: float(row["from_nothing_s"]) for row in rows}
+
+
+def measured_row(
+    out: Path, name: str, *, checkout: Path, quick: bool, before_s: float | None
+) -> Row:
     """Run an experiment three times in a folder of its own, because experiments share renders;
     return its row."""
     shutil.rmtree(out, ignore_errors=True)
     began = time.monotonic()
-    run(out, name, quick=quick)
+    run(out, name, checkout=checkout, quick=quick)
     minutes = (time.monotonic() - began) / 60
-    row = row_of_bill(out, name)
-    row.append(f"{minutes:.1f}")
+    first = row_of_bill(out, name, before_s)
     shutil.rmtree(out / name)
-    for _ in MEASURED[1:]:
-        run(out, name, quick=quick)
-        seconds = bill_of(out, name)[BILL]
-        row.append(f"{sum(seconds.values()):.0f}")
-    return row
+    again_s = []
+    for _ in ("renders stored", "all stored"):
+        run(out, name, checkout=checkout, quick=quick)
+        again_s.append(sum(bill_of(out, name)[BILL].values()))
+    return Row(
+        experiment=name,
+        views=first.views,
+        trials=first.trials,
+        before_s=before_s,
+        from_nothing_s=first.from_nothing_s,
+        fixed_s=first.fixed_s,
+        from_nothing_min=round(minutes, 2),
+        renders_stored_s=round(again_s[0], 2),
+        all_stored_s=round(again_s[1], 2),
+    )
 
 
-def run(out: Path, name: str, *, quick: bool) -> None:
-    """Run an experiment; its page and tables go to ``out``."""
+def run(out: Path, name: str, *, checkout: Path, quick: bool) -> None:
+    """Run an experiment; its page and tables go to ``out``. What fails in it is told on the
+    terminal, and costs too."""
     command = [sys.executable, "-m", "harness", "sweep", name, "--out", str(out)]
     if quick:
         command.append("--quick")
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    environment = os.environ | {"PYTHONPATH": str(checkout.absolute())}
+    ended = subprocess.run(command, cwd=checkout, env=environment, stdout=subprocess.DEVNULL)
+    if ended.returncode not in (0, 1):
+        raise SystemExit(f"{name} ended with exit code {ended.returncode}")
 
 
 def bill_of(out: Path, name: str) -> Mapping[str, Any]:
@@ -91,20 +195,20 @@ def bill_of(out: Path, name: str) -> Mapping[str, Any]:
     return {}
 
 
-def row_of_bill(out: Path, name: str) -> list[str]:
+def row_of_bill(out: Path, name: str, before_s: float | None) -> Row:
     """Return the cells of an experiment's row that its newest bill fills."""
     facts = bill_of(out, name)
     if BILL not in facts:
-        return [f"`{name}`", *["no bill"] * (len(BILLED) - 1)]
+        return Row(experiment=name, before_s=before_s)
     seconds = facts[BILL]
-    fixed_s = sum(seconds[phase] for phase in FIXED)
-    return [
-        f"`{name}`",
-        str(facts["renders"]["done"]),
-        str(facts["trials"]["done"]),
-        f"{sum(seconds.values()):.0f}",
-        f"{fixed_s:.0f}",
-    ]
+    return Row(
+        experiment=name,
+        views=facts["renders"]["done"],
+        trials=facts["trials"]["done"],
+        before_s=before_s,
+        from_nothing_s=round(sum(seconds.values()), 2),
+        fixed_s=round(sum(seconds[phase] for phase in FIXED), 2),
+    )
 
 
 if __name__ == "__main__":

@@ -138,9 +138,12 @@ class ModelAverage:
         a90/95."""
         edges = np.empty((2, len(sizes)))
         shares = [self.tail, 1.0 - self.tail]
+        order = np.arange(len(self.curves.weight))
         for number, size in enumerate(np.maximum(sizes, np.finfo(float).tiny)):
             pods = self.curves.pods(float(size))
-            edges[:, number] = weighted_quantiles(pods, self.curves.weight, shares)
+            # nearly sorted as at the size before, which takes a fifth of the time to sort
+            order = order[np.argsort(pods[order], kind="stable")]
+            edges[:, number] = _quantiles_in(order, pods, self.curves.weight, shares)
         return edges[0], edges[1]
 
     def _constant(self) -> str:
@@ -172,7 +175,15 @@ def weighted_quantiles(
 ) -> np.ndarray:
     """Return the values (s,) below which these shares of the weight (n,) lie, whose sum is 1."""
     order = np.argsort(values, kind="stable")
-    below = np.cumsum(weight[order]) - weight[order] / 2
+    return _quantiles_in(order, values, weight, shares)
+
+
+def _quantiles_in(
+    order: np.ndarray, values: np.ndarray, weight: np.ndarray, shares: Sequence[float]
+) -> np.ndarray:
+    """Return `weighted_quantiles` of values (n,) whose ascending order (n,) is known."""
+    sorted_weight = weight[order]
+    below = np.cumsum(sorted_weight) - sorted_weight / 2
     return np.asarray(np.interp(shares, below, values[order]))
 
 

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, special
@@ -106,13 +108,24 @@ def slopes_of_link(link: str, predictor: np.ndarray) -> tuple[np.ndarray, np.nda
         miss = special.expit(-t)
         return miss, hit, miss - hit
     log_hit, log_miss, log_density = logs_of_link(link, t)
+    return np.exp(log_density - log_hit), np.exp(log_density - log_miss), _bend(link, t)
+
+
+def _log_density(link: str, t: np.ndarray) -> np.ndarray:
+    """Return ln f of any link but logit, at limited predictors."""
     if link == "probit":
-        bend = -t
-    elif link == "cloglog":
-        bend = 1.0 - np.exp(t)
-    else:
-        bend = np.exp(-t) - 1.0
-    return np.exp(log_density - log_hit), np.exp(log_density - log_miss), bend
+        return np.asarray(-0.5 * t * t - 0.5 * np.log(2.0 * np.pi))
+    signed = t if link == "cloglog" else -t
+    return np.asarray(signed - np.exp(signed))
+
+
+def _bend(link: str, t: np.ndarray) -> np.ndarray:
+    """Return d ln f / dt of any link but logit, at limited predictors."""
+    if link == "probit":
+        return -t
+    if link == "cloglog":
+        return np.asarray(1.0 - np.exp(t))
+    return np.asarray(np.exp(-t) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -172,6 +185,23 @@ PENALISED_SLOPES = np.linspace(np.log(1e-8), np.log(1e4), 140)
 """Natural logarithms of the slopes at which the search of a penalised profile starts."""
 
 
+class _Outcome(NamedTuple):
+    """Hits, or misses: their probability is F(t) of a link, with t the predictor times a sign."""
+
+    # rows (k,) that have this outcome in any study
+    rows: np.ndarray
+    # how often (..., k) they have it
+    counts: np.ndarray
+    # the study's link for hits, the mirrored link for misses
+    link: str
+    # 1 for hits, -1 for misses
+    sign: float
+
+    def of_rows(self, predictor: np.ndarray) -> np.ndarray:
+        """Return t (..., k) from the predictors (..., n) of all rows."""
+        return np.asarray(self.sign * predictor[..., self.rows])
+
+
 @dataclass(frozen=True, eq=False)
 class HitsAndMisses:
     """Hits and misses of one or several (d) studies on the same rows, and their likelihood."""
@@ -202,39 +232,71 @@ class HitsAndMisses:
             by_row = self.design @ b.T + self.offset
             rows = log_likelihoods(self.link, by_row, self.hits, self.misses)
             return np.asarray(rows.sum(axis=0))
-        predictor = b @ self.design.T + self.offset
+        predictor = _limited(b @ self.design.T + self.offset)
+        if self.penalty is None:
+            return self._plain_value(predictor, self._outcome_logs(predictor))
         log_hit, log_miss, log_density = logs_of_link(self.link, predictor)
+        weight = (self.hits + self.misses) * np.exp(2.0 * log_density - log_hit - log_miss)
+        total = weight.sum(-1)
+        cross = weight @ self.z
+        square = weight @ self.z**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scatter = np.maximum(square - cross**2 / total, 0.0)
+            prior = 0.5 * (np.log(total) + np.log(scatter))
         value = (self.hits * log_hit + self.misses * log_miss).sum(axis=-1)
-        if self.penalty is not None:
-            weight = (self.hits + self.misses) * np.exp(2.0 * log_density - log_hit - log_miss)
-            total = weight.sum(-1)
-            cross = weight @ self.z
-            square = weight @ self.z**2
-            with np.errstate(divide="ignore", invalid="ignore"):
-                scatter = np.maximum(square - cross**2 / total, 0.0)
-                prior = 0.5 * (np.log(total) + np.log(scatter))
-            value = value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf)
-        return np.asarray(value)
+        return np.asarray(value + self.penalty * np.where(np.isfinite(prior), prior, -np.inf))
+
+    @cached_property
+    def _outcomes(self) -> tuple[_Outcome, _Outcome]:
+        """The hits and the misses. Most rows have one outcome only, in all studies."""
+        outcomes = []
+        sides = ((self.hits, self.link, 1.0), (self.misses, _MIRRORED[self.link], -1.0))
+        for counts, link, sign in sides:
+            rows = np.flatnonzero(counts.reshape(-1, counts.shape[-1]).any(axis=0))
+            outcomes.append(_Outcome(rows, counts[..., rows], link, sign))
+        return outcomes[0], outcomes[1]
+
+    def _outcome_logs(self, predictor: np.ndarray) -> list[np.ndarray]:
+        """Return the logarithms (..., k) of the probability of each of the `_outcomes`."""
+        logs = []
+        for outcome in self._outcomes:
+            logs.append(_LOG_CDF[outcome.link](outcome.of_rows(predictor)))
+        return logs
+
+    def _plain_value(self, predictor: np.ndarray, logs: list[np.ndarray]) -> np.ndarray:
+        """Return the log-likelihood (...) without a penalty, from the `_outcome_logs`."""
+        of_rows = np.zeros_like(predictor)
+        for outcome, log_probability in zip(self._outcomes, logs, strict=True):
+            of_rows[..., outcome.rows] += outcome.counts * log_probability
+        return np.asarray(of_rows.sum(axis=-1))
 
     def step(self, b: np.ndarray) -> np.ndarray:
         """Return Newton steps (d, p) of (d,) studies at b (d, p); with a penalty, scoring steps.
         They are meaningless if the information is singular, in studies that diverge to infinity.
         """
         with np.errstate(all="ignore"):
-            if self.penalty is None:
-                return self._newton_step(b)
-            return self._penalised_step(b)
+            if self.penalty is not None:
+                return self._penalised_step(b)
+            predictor = _limited(b @ self.design.T + self.offset)
+            return self._newton_step(predictor, self._outcome_logs(predictor))
 
-    def _newton_step(self, b: np.ndarray) -> np.ndarray:
-        """Solve the observed information for the gradient of the log-likelihood."""
-        up, down, bend = slopes_of_link(self.link, b @ self.design.T + self.offset)
-        slope = self.hits * up - self.misses * down
+    def _newton_step(self, predictor: np.ndarray, logs: list[np.ndarray]) -> np.ndarray:
+        """Solve the observed information for the gradient of the log-likelihood at limited
+        predictors (d, n), of which ``logs`` are the `_outcome_logs`."""
         if self.link == "logit":  # the same in fewer operations
+            up, down, _ = slopes_of_link(self.link, predictor)
+            slope = self.hits * up - self.misses * down
             weight = (self.hits + self.misses) * up * down
         else:
-            of_hits = self.hits * up * np.maximum(up - bend, 0.0)
-            of_misses = self.misses * down * np.maximum(down + bend, 0.0)
-            weight = of_hits + of_misses
+            slope = np.zeros_like(predictor)
+            weight = np.zeros_like(predictor)
+            for outcome, log_probability in zip(self._outcomes, logs, strict=True):
+                t = outcome.of_rows(predictor)
+                ratio = np.exp(_log_density(outcome.link, t) - log_probability)
+                scaled = outcome.counts * ratio
+                slope[..., outcome.rows] += outcome.sign * scaled
+                bend = _bend(outcome.link, t)
+                weight[..., outcome.rows] += scaled * np.maximum(ratio - bend, 0.0)
         columns = self.design.shape[1]
         if columns == 1:
             return np.asarray((slope @ self.design) / (weight @ self.design**2))
@@ -281,8 +343,16 @@ class HitsAndMisses:
         """Return values (k,) and steps (k, p) of k ``studies`` at b (k, p), for `ascend`."""
         is_all = self.penalty is None and len(studies) == len(self.hits)
         chosen = self if is_all else self.select(studies)
-        value = chosen.value(b)
-        return np.where(np.isfinite(value), value, -np.inf), chosen.step(b)
+        if self.penalty is not None:
+            value = chosen.value(b)
+            step = chosen.step(b)
+        else:
+            predictor = _limited(b @ self.design.T + self.offset)
+            logs = chosen._outcome_logs(predictor)
+            value = chosen._plain_value(predictor, logs)
+            with np.errstate(all="ignore"):
+                step = chosen._newton_step(predictor, logs)
+        return np.where(np.isfinite(value), value, -np.inf), step
 
 
 def ascend(

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize, stats
+from scipy import optimize, special
 from scipy.optimize import elementwise
 
 from harness.evaluation.pod.curve import (
@@ -272,7 +272,7 @@ def _tested(
     """Test the likeliest curve with floor and ceiling in these ranges."""
     likeliest, value = _search(fit.data, fit.maximum, floor, ceiling)
     statistic = max(2.0 * (value - fit.log_likelihood) / fit.repeats, 0.0)
-    tail_of_one, tail_of_two = stats.chi2.sf(statistic, [1, 2])
+    tail_of_one, tail_of_two = special.chdtrc([1, 2], statistic)
     p_value = 0.5 * tail_of_one
     if beyond == "both":
         p_value = 0.5 * tail_of_one + 0.25 * tail_of_two
@@ -469,7 +469,7 @@ def criterion(confidence: float) -> float:
     """Return the largest 2 (llmax - ll) of the confidence set: 3.841 at 95 %."""
     if not 0.5 < confidence < 1:
         raise UserError(f"confidence {confidence:g} is out of range", legal="between 0.5 and 1")
-    return float(stats.chi2.ppf(confidence, 1))
+    return 2.0 * float(special.gammaincinv(0.5, confidence))
 
 
 def _likelihood_bound(

@@ -1,13 +1,12 @@
 """The statement on one set of inspections, from hits and misses or from signals: curve, bounds,
 and their basis."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from threadpoolctl import ThreadpoolController
 
 from harness.evaluation.pod import hit_miss
@@ -83,8 +82,8 @@ class PodStatement:
     signals."""
     signal: AhatFit | None
     """The regression of signals; None for hits."""
-    models: tuple[ModelRow, ...]
-    """All models that were tried."""
+    tried: tuple[HitMissFit | AhatFit, ...]
+    """All models that were tried, the likeliest first."""
     bound: Bound
     """a90/95."""
     numbers: dict[str, float]
@@ -127,7 +126,26 @@ class PodStatement:
     @property
     def model(self) -> str:
         """Name of the model of the curve."""
-        return next(row.name for row in self.models if row.chosen)
+        return _model_name(self.signal or self.fits[0])
+
+    @cached_property
+    def models(self) -> tuple[ModelRow, ...]:
+        """All models that were tried, with their bounds; computed when needed, as studies do not
+        show them."""
+        close_fits = self.fits or (self.signal,)
+        rows = []
+        for fit in self.tried:
+            row = ModelRow(
+                name=_model_name(fit),
+                deviance=fit.deviance,
+                a50=fit.curve.size_at(0.5),
+                a90=fit.curve.size_at(POD),
+                bound=_bound_of(fit),
+                chosen=fit is close_fits[0],
+                in_bound=any(fit is close_fit for close_fit in close_fits),
+            )
+            rows.append(row)
+        return tuple(rows)
 
     @property
     def counts(self) -> str:
@@ -239,11 +257,10 @@ def state_hits(
         fit = allowed[0]
         close_fits = hit_miss.near_models(allowed)
         tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
-        bounds = [hit_miss.bound(fit, POD, CONFIDENCE) for fit in tried]
         average: ModelAverage | None = None
         if len(allowed) > 1:
             average = ModelAverage(close_fits)
-        limit = average.bound(POD) if average else bounds[tried.index(fit)]
+        limit = average.bound(POD) if average else _bound_of(fit)
 
     notes = [*read.notes, *fit.notes]
     if fit.targets < LEAST_TARGETS:
@@ -282,7 +299,7 @@ def state_hits(
         fits=close_fits,
         average=average,
         signal=None,
-        models=_models(tried, bounds, close_fits),
+        tried=tried,
         bound=limit,
         numbers=numbers,
         notes=tuple(notes),
@@ -338,7 +355,6 @@ def state_signals(
         "decision": fit.decision,
         **false_positives(read, fit),
     }
-    bounds = [ahat_bound(fit, POD, CONFIDENCE) for fit in tried]
     return PodStatement(
         read=read,
         kind="signal against size",
@@ -346,8 +362,8 @@ def state_signals(
         fits=(),
         average=None,
         signal=fit,
-        models=_models(tried, bounds, (fit,)),
-        bound=ahat_bound(fit, POD, CONFIDENCE),
+        tried=tried,
+        bound=_bound_of(fit),
         numbers=numbers,
         notes=(*read.notes, *fit.notes),
         tests=tuple(_diagnostic_row(test) for test in diagnose(fit)),
@@ -360,29 +376,11 @@ def _diagnostic_row(test: Diagnostic) -> tuple[str, float, str]:
     return f"{test.assumption} ({test.test})", test.p_value, f"{reading} at {LEVEL:.0%}"
 
 
-PodFit = TypeVar("PodFit", HitMissFit, AhatFit)
-
-
-def _models(
-    tried: Sequence[PodFit],
-    bounds: Sequence[Bound],
-    close_fits: Sequence[PodFit],
-) -> tuple[ModelRow, ...]:
-    """Return rows of fits with their ``bounds``; the first of the ``close_fits`` fits is that of
-    the curve."""
-    rows = []
-    for fit, limit in zip(tried, bounds, strict=True):
-        row = ModelRow(
-            name=_model_name(fit),
-            deviance=fit.deviance,
-            a50=fit.curve.size_at(0.5),
-            a90=fit.curve.size_at(POD),
-            bound=limit,
-            chosen=fit is close_fits[0],
-            in_bound=any(fit is close_fit for close_fit in close_fits),
-        )
-        rows.append(row)
-    return tuple(rows)
+def _bound_of(fit: HitMissFit | AhatFit) -> Bound:
+    """Return a90/95 by one model alone."""
+    if isinstance(fit, HitMissFit):
+        return hit_miss.bound(fit, POD, CONFIDENCE)
+    return ahat_bound(fit, POD, CONFIDENCE)
 
 
 def _model_name(fit: HitMissFit | AhatFit) -> str:
@@ -405,7 +403,7 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
     calls = int((sites > decision).sum())
     upper = 1.0
     if calls < len(sites):
-        upper = float(stats.beta.ppf(CONFIDENCE, calls + 1, len(sites) - calls))
+        upper = float(special.betaincinv(calls + 1, len(sites) - calls, CONFIDENCE))
     numbers = {
         "unflawed sites": float(len(sites)),
         "false positives": float(calls),
@@ -421,6 +419,8 @@ def false_positives(read: Inspections, fit: AhatFit | None = None) -> dict[str, 
 def _false_positives_by_noise(sites: np.ndarray, fit: AhatFit) -> float | None:
     """Return the probability that a normal law of the ``sites``' noise exceeds the decision; None
     if there are too few to fit it, or some have no logarithm."""
+    from scipy import stats
+
     if fit.log_signal and not (sites > 0).all():
         return None
     limit = -np.inf if fit.left is None else fit.left

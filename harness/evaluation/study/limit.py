@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from harness.evaluation.intervals import (
     UNKNOWN,
@@ -46,8 +46,8 @@ from harness.vocabulary.errors import UserError
 ALL_FOUND = int(np.ceil(np.log(1 - CONFIDENCE) / np.log(POD)))
 """29: with a POD below 90 %, this many targets are all found in less than 5 % of studies (0.9^29 =
 0.047)."""
-ONE_SIDED = float(stats.norm.ppf(CONFIDENCE))
-TWO_SIDED = float(stats.norm.ppf(UPPER))
+ONE_SIDED = float(special.ndtri(CONFIDENCE))
+TWO_SIDED = float(special.ndtri(UPPER))
 WIDER = 1.1  # boards matter if the limit over boards exceeds a90/95 by more than this factor
 
 

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from harness.evaluation.intervals import UNKNOWN, UPPER, Interval
 from harness.evaluation.pod.ahat import AhatFit, diagnose, fit_ahat
@@ -86,7 +86,8 @@ class SignalLine:
         curve = self.fit.curve
         x = curve.mu + curve.sigma * float(special.ndtri(pod))
         deviation = np.sqrt(self.variance(pod))
-        values = x + deviation * stats.t.ppf(QUANTILES, max(len(self.influence) - 1, 1))
+        degrees = max(len(self.influence) - 1, 1)
+        values = x + deviation * special.stdtrit(degrees, QUANTILES)
         with np.errstate(over="ignore"):
             return np.asarray(np.exp(values) if curve.log_size else values)
 
@@ -213,7 +214,7 @@ def _agreement(fit: AhatFit, hits: HitMissFit) -> float:
     t = (fit.x - curve.mu) / curve.sigma
     by_signal = np.where(fit.below, special.log_ndtr(-t), special.log_ndtr(t)).sum()
     ratio = 2 * (hits.log_likelihood - float(by_signal)) / hits.repeats
-    return float(stats.chi2.sf(max(ratio, 0.0), 2))
+    return float(special.chdtrc(2, max(ratio, 0.0)))
 
 
 def _line(record: SetUpRecord, fit: AhatFit) -> SignalLine:

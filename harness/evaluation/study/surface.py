@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from harness.evaluation.intervals import UNKNOWN, percentiles
 from harness.evaluation.pod.curve import HitsAndMisses, link_cdf, link_ppf, maxima
@@ -92,7 +92,7 @@ def surface_of(record: SetUpRecord, draws: int = DRAWS) -> tuple[PodSurface | No
     if not _separated(crossed, inspected.hit):
         bent = _fit(fit.link, crossed, inspected.hit)
         ratio = max(fit.deviance - bent.deviance, 0.0) / _repeats(inspected)
-        interaction_p = float(chi2.sf(ratio, 1))
+        interaction_p = float(chdtrc(1, ratio))
         if interaction_p < LEVEL and _rises(bent.b, d):
             fit = bent
             terms = 4

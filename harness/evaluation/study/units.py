@@ -13,7 +13,7 @@ parts)."""
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from harness.evaluation.pod.curve import Bound, PodCurve
 from harness.evaluation.pod.hit_miss import bound, fit_hit_miss
@@ -101,7 +101,7 @@ def _new_unit(
     if not limit.demonstrated:
         why = limit.why.removeprefix("not demonstrated: ")
         return Bound(POD, CONFIDENCE, METHOD, np.inf, f"not demonstrated: {why}")
-    of_units = float(t.ppf(CONFIDENCE, units - 1)) * spread * np.sqrt(1 + 1 / units)
+    of_units = float(stdtrit(units - 1, CONFIDENCE)) * spread * np.sqrt(1 + 1 / units)
     of_boards = np.log(limit.value / a90)
     value = a90 * float(np.exp(np.hypot(of_boards, of_units)))
     return Bound(POD, CONFIDENCE, METHOD, value)

@@ -72,10 +72,11 @@ class HaloNoise(NamedTuple):
 
 
 def first_order(
-    imager: AmcwImager, exposure: AmcwExposure, wanted: np.ndarray
+    imager: AmcwImager, exposure: AmcwExposure, wanted: np.ndarray, jitter_mm: float
 ) -> FirstOrder | None:
-    """Return the first-order model of a view at the ``wanted`` (h, w) bool pixels; None if whole
-    frames cost less, because it holds for too few of them."""
+    """Return the first-order model of a view at the ``wanted`` (h, w) bool pixels, whose frames
+    are displaced by ``jitter_mm``; None if whole frames cost less, because it holds for too few of
+    them."""
     window = imager.filter_settings
     shape = exposure.shape
     n = exposure.sigma.size
@@ -111,7 +112,6 @@ def first_order(
 
     # which pixels go through the whole chain
     unit = imager.camera.unit
-    jitter_mm = imager.jitter_mm(exposure)
     farthest_mm = unit.jump_mm.value + JITTERS * jitter_mm + abs(unit.drift_mm.value)
     farthest_m = farthest_mm * MM
     certain = certainty(filtered, imager.engine, shape, farthest_m)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detectors.surfaces import smooth_surfaces
+from detectors.surfaces import extruded, smooth_surfaces
 from detectors.surfaces.background import background
 from detectors.surfaces.extruded import (
     MOST_STRIPS,
     Profile,
     direction_of,
     explains_better,
+    profiled,
     with_twist,
 )
 from detectors.surfaces.faces import turns_back
@@ -143,6 +144,23 @@ def test_a_plane_is_no_profile() -> None:
     assert directed is None or not explains_better(with_twist(directed, points), plane, points)
 
 
+@pytest.mark.parametrize(("depth_m", "is_sought"), [(0.0, False), (3e-4, True)])
+def test_a_twist_is_sought_only_of_a_profile_that_is_there(
+    depth_m: float, is_sought: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sought = []
+
+    def search(profile: Profile, points: np.ndarray) -> Profile:
+        sought.append(profile)
+        return with_twist(profile, points)
+
+    monkeypatch.setattr(extruded, "with_twist", search)
+    cloud = cloud_of(grooved(depth_m))
+    ground = background(cloud, cloud.valid, SurfaceConfig(shape="auto"))
+    assert bool(sought) == is_sought
+    assert ground.notes["shape"].startswith("extruded") == is_sought
+
+
 @pytest.mark.parametrize("extent", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.2)])
 def test_points_in_one_place_or_in_a_plane_through_the_camera_have_no_direction(
     extent: tuple[float, float],
@@ -182,6 +200,7 @@ def test_a_crease_of_a_bent_sheet_is_fitted_to_its_ends() -> None:
     is_crease = np.abs(across_m - 0.1 * along_m) < 0.02
     at_crease_m = float(np.sqrt(np.mean(residuals_m[is_end & is_crease] ** 2)))
     assert at_crease_m < 1.5 * 2e-4
+    assert profiled(directed, base, points, 0.0) is not None
 
 
 def test_a_trapezoid_turns_back_and_a_corner_does_not() -> None:

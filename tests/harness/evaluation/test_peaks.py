@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import special, stats
 
 from harness.evaluation.intervals import threshold_for_rate
-from harness.evaluation.peaks import ScoreTail, fitted_tail, threshold_from_peaks
+from harness.evaluation.peaks import (
+    LEVEL,
+    ScoreTail,
+    fitted_tail,
+    is_uneven,
+    threshold_from_peaks,
+)
 from harness.vocabulary.errors import UserError
 
 AREA_M2 = 0.054
@@ -91,3 +97,16 @@ def test_few_boards_or_scores_have_no_tail() -> None:
 def test_too_few_boards_for_the_rate_are_refused() -> None:
     with pytest.raises(UserError, match="too few for a rate of"):
         threshold_from_peaks(boards(60, seed=1), AREA_M2, 0.1)
+
+
+def test_values_are_uneven_as_kolmogorovs_test_says() -> None:
+    """Values crowded more and more towards 1, so that p-values lie on both sides of the level."""
+    even = np.random.default_rng(3).random(40)
+    answers = []
+    for power in np.geomspace(0.3, 1.0, 60):
+        values = even**power
+        expected = stats.kstest(values, "uniform").pvalue < LEVEL
+        assert is_uneven(values) == expected
+        assert is_uneven(1.0 - values) == expected
+        answers.append(bool(expected))
+    assert 10 < sum(answers) < 50

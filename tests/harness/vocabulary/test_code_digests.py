@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from harness.vocabulary import code_digests as digests_module
 from harness.vocabulary import provenance
-from harness.vocabulary.code_digests import changed_parts, code_digests, file_digests
+from harness.vocabulary.code_digests import (
+    changed_parts,
+    code_digests,
+    file_digests,
+    remembered,
+)
+from harness.vocabulary.files import strict_json
 
 FILES = {
     "harness/__init__.py": "",
@@ -42,8 +50,10 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def forget() -> None:
+    digests_module._known.clear()
     for cached in (
         provenance.reached_sources,
+        provenance.imported_sources,
         provenance.first_content,
         digests_module._syntax_digest,
     ):
@@ -123,3 +133,44 @@ def test_files_count_by_their_content(project: Path):
 
 def test_a_part_that_is_new_or_gone_is_a_change():
     assert changed_parts({"a": "1", "b": "2"}, {"b": "2", "c": "3"}) == ["a", "c"]
+
+
+def test_sources_that_a_file_remembers_are_not_parsed_again(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed = []
+
+    def parse(content: bytes) -> ast.AST:
+        parsed.append(content)
+        return ast.parse(content)
+
+    monkeypatch.setattr(digests_module, "ast", SimpleNamespace(**vars(ast) | {"parse": parse}))
+    store = project / ".cache" / "sources.json"
+    with remembered(store):
+        first = fresh()
+    assert len(parsed) == 3
+    assert fresh() == first
+    parsed.clear()
+    forget()
+    with remembered(store):
+        assert code_digests(["harness.trials.trial"]) == first
+    assert not parsed
+
+    # a change is seen, and alone parsed
+    (project / TRIAL).write_text(FILES[TRIAL].replace("K = 5", "K = 6"))
+    forget()
+    with remembered(store):
+        assert changed_parts(first, code_digests(["harness.trials.trial"])) == ["harness/trials"]
+    assert len(parsed) == 1
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"by": "another", "digests": 3}'])
+def test_a_file_that_is_no_memory_does_not_count(project: Path, content: str | None) -> None:
+    expected = fresh()
+    store = project / "sources.json"
+    if content is not None:
+        store.write_text(content)
+    forget()
+    with remembered(store):
+        assert code_digests(["harness.trials.trial"]) == expected
+    assert len(strict_json(store.read_bytes())["digests"]) > 1

@@ -38,7 +38,12 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def forget() -> None:
-    for cached in (reached_sources, source_digest, provenance.first_content):
+    for cached in (
+        reached_sources,
+        provenance.imported_sources,
+        source_digest,
+        provenance.first_content,
+    ):
         cached.cache_clear()
 
 

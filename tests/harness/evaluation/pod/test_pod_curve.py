@@ -127,6 +127,30 @@ def test_the_penalty_is_half_the_logarithm_of_the_information(link: str) -> None
     assert data_of(link, 3.0).value(b) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize("link", LINKS)
+def test_rows_of_one_outcome_count_as_those_of_both(link: str) -> None:
+    """Values and steps of several studies, of which some rows are never hit or never missed, are
+    those by the logarithms and slopes of both outcomes, to the last bit."""
+    data = studies_of(data_of(link))
+    data = replace(data, hits=data.hits * (SIZES > -1.0), misses=data.misses * (SIZES < 1.0))
+    b = np.array([[0.3, 1.4], [-0.2, 3.0]])
+    predictor = b @ data.design.T
+    log_hit, log_miss, _ = logs_of_link(link, predictor)
+    expected = (data.hits * log_hit + data.misses * log_miss).sum(axis=1)
+    value, step = data.climb(b, np.arange(2))
+    assert value.tolist() == expected.tolist()
+    assert data.value(b).tolist() == expected.tolist()
+
+    up, down, bend = slopes_of_link(link, predictor)
+    of_hits = data.hits * up * np.maximum(up - bend, 0.0)
+    of_misses = data.misses * down * np.maximum(down + bend, 0.0)
+    gradient = (data.hits * up - data.misses * down) @ data.design
+    weighted = (of_hits + of_misses)[:, :, None] * data.design
+    information = weighted.transpose(0, 2, 1) @ data.design
+    newton = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+    assert step == pytest.approx(newton, rel=1e-9)
+
+
 def numeric_gradient(data: HitsAndMisses, b: np.ndarray) -> np.ndarray:
     step = 1e-5 * np.eye(len(b))
     return np.array([(data.value(b + h) - data.value(b - h)) / 2e-5 for h in step])

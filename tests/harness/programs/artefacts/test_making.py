@@ -71,6 +71,7 @@ CACHED = (
     declaration._command_digests,
     provenance.first_content,
     provenance.reached_sources,
+    provenance.imported_sources,
     digests_module._syntax_digest,
 )
 
