@@ -131,6 +131,11 @@ PROGRAMS = (
         "fits the probability of detection to the user's own inspections (MIL-HDBK-1823A)",
     ),
     ProgramEntry(
+        "record",
+        "harness.programs.record.record",
+        "records a depth camera, or a file, and says what its frames show",
+    ),
+    ProgramEntry(
         "score",
         "harness.programs.dataset.score",
         "states the detection limit of a method's anomaly maps",

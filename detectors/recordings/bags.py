@@ -8,7 +8,7 @@ points, z and that lens are used: a pixel's ray is then the same in all frames."
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import count
@@ -175,7 +175,7 @@ def _holds_messages(path: Path) -> bool:
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-UNIT_TYPE = "std_msgs/msg/Float32"
+UNIT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/String")
 USUAL_TOPIC = "points2"
 RAY_TOLERANCE_PX = 0.01
 """A lens fits if each point lies within this distance of its pixel's ray: far more than the error
@@ -201,6 +201,8 @@ def _frames(bag: Bag, topic: str, scale_m: float, by_lens: bool) -> Iterator[Fra
     from the lens."""
     for name, message in bag.messages(topic):
         frame = frame_of_message(name, message, scale_m)
+        stamp = message.header.stamp
+        frame = replace(frame, time_s=stamp.sec + 1e-9 * stamp.nanosec)
         yield replace(frame, xy_m=None) if by_lens else frame
 
 
@@ -280,15 +282,18 @@ def _open_images(bag: Bag, topic: str, options: CaptureOptions) -> Recording:
 
 def _stated_unit(bag: Bag, topic: str) -> tuple[str, float] | None:
     """Return the topic that states the unit of a depth topic, and the unit in metres: RealSense's
-    viewer states it with a sensor's streams."""
+    recorder states it with a sensor's streams, as a number in .bag and as a text in .db3."""
     for name, kind in bag.topics.items():
         sensor, _, option = name.partition("/option/")
-        is_unit = kind == UNIT_TYPE and option.startswith("Depth_Units")
-        if is_unit and topic.startswith(sensor + "/"):
-            message = bag.first(name)
-            if message is not None and 1e-6 <= message.data <= 1:
+        is_unit = kind in UNIT_TYPES and option.startswith("Depth_Units")
+        message = bag.first(name) if is_unit and topic.startswith(sensor + "/") else None
+        if message is None:
+            continue
+        with suppress(ValueError):  # its description is a text, too
+            unit_m = float(message.data)
+            if 1e-6 <= unit_m <= 1:
                 # the option is a float32: 0.00025 is stored as 0.00025000001
-                return name, float(f"{message.data:.6g}")
+                return name, float(f"{unit_m:.6g}")
     return None
 
 

@@ -9,7 +9,7 @@ OpenCV would decode 30,000 x 30,000 pixels into gigabytes."""
 import io
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
@@ -96,7 +96,26 @@ def open_depth_folder(folder: Path, options: CaptureOptions) -> Recording:
     if pictures and (None in colours or len(pictures) != len(depths)):
         without = f"{colours.count(None)} depth pictures have no colour"
         note = f"{len(depths)} depth and {len(pictures)} colour pictures: {without}"
-    return open_depth_list(depths, options, folder.name, root, colours, is_tum, note)
+    recording = open_depth_list(depths, options, folder.name, root, colours, is_tum, note)
+    inner = root / "amplitude"
+    if not inner.is_dir():
+        return recording
+    amplitudes = [inner / path.name for path in depths if (inner / path.name).is_file()]
+    read = partial(_with_amplitudes, recording.read, depths, inner)
+    return replace(recording, read=read, files=(*recording.files, *amplitudes))
+
+
+def _with_amplitudes(
+    read: Callable[[], Iterator[Frame]], depths: Sequence[Path], folder: Path
+) -> Iterator[Frame]:
+    """Yield frames with the amplitude pictures of the same names that `tofpod record` writes; those
+    of another size are left out."""
+    for frame, depth in zip(read(), depths, strict=True):
+        path = folder / depth.name
+        amplitude = read_depth_png(path).astype(np.float32) if path.is_file() else None
+        if amplitude is not None and amplitude.shape != frame.z_m.shape:
+            amplitude = None
+        yield replace(frame, amplitude=amplitude)
 
 
 def _colour_pictures(root: Path, depths: Sequence[Path]) -> list[Path]:

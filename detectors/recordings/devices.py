@@ -111,11 +111,13 @@ def _frames(path: Path, scale_m: float, lens: Lens, colour: ColourCamera | None)
     """Yield one frame per depth picture. Raises UserError if the file is truncated or cannot be
     decoded."""
     slopes = lens.region_slopes(lens.whole)
-    for number, pictures in enumerate(_captures(path, with_colour=colour is not None)):
+    captures = _captures(path, with_colour=colour is not None)
+    for number, (time_s, pictures) in enumerate(captures):
         name = f"{path.name} frame {number}"
         infrared = pictures.get("IR")
         amplitude = infrared.astype(np.float32) if infrared is not None else None
         frame = frame_of(name, pictures["DEPTH"], scale_m, amplitude=amplitude)
+        frame = replace(frame, time_s=time_s)
         if colour is not None and "COLOR" in pictures:
             rgb = colour_on_depth(frame.z_m, slopes, colour, pictures["COLOR"])
             frame = replace(frame, rgb=rgb)
@@ -172,9 +174,9 @@ def _tracks(container: Any) -> dict[str, Any]:
     return tracks
 
 
-def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
-    """Yield the pictures of one instant (within half a frame period) by track title, in order of
-    time."""
+def _captures(path: Path, with_colour: bool) -> Iterator[tuple[float, dict[str, np.ndarray]]]:
+    """Yield the time in s and the pictures of one instant (within half a frame period) by track
+    title, in order of time."""
     waiting: list[tuple[float, dict[str, np.ndarray]]] = []
     for title, time_s, period_s, picture in _pictures(path, with_colour):
         for capture_s, capture in waiting:
@@ -185,12 +187,12 @@ def _captures(path: Path, with_colour: bool) -> Iterator[dict[str, np.ndarray]]:
             waiting.append((time_s, {title: picture}))
             waiting.sort(key=lambda capture: capture[0])
         if len(waiting) > WAITING:
-            _, oldest = waiting.pop(0)
+            oldest_s, oldest = waiting.pop(0)
             if "DEPTH" in oldest:
-                yield oldest
-    for _, capture in waiting:
+                yield oldest_s, oldest
+    for capture_s, capture in waiting:
         if "DEPTH" in capture:
-            yield capture
+            yield capture_s, capture
 
 
 def _pictures(path: Path, with_colour: bool) -> Iterator[tuple[str, float, float, np.ndarray]]:

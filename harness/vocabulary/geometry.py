@@ -240,7 +240,8 @@ class Frame:
     """One exposure. ``z_m`` (h, w) float32 is the distance along the optical axis, NaN where
     invalid. ``reason`` (h, w) uint8 holds `Reason`. ``xy_m`` (h, w, 2) is given only if the source
     has no lens (a stored point cloud); ``rgb`` (h, w, 3) uint8 and ``amplitude`` (h, w) float32 if
-    known. ``notes`` say how stored numbers were interpreted."""
+    known. ``time_s`` is the camera's clock, if known. ``notes`` say how stored numbers were
+    interpreted."""
 
     name: str
     z_m: np.ndarray
@@ -249,6 +250,7 @@ class Frame:
     rgb: np.ndarray | None = None
     amplitude: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    time_s: float | None = None
 
 
 class FrameSource(Protocol):

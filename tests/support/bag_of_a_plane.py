@@ -32,6 +32,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
 PACKED = "sensor_msgs/msg/CompressedImage"
+TEXT = "std_msgs/msg/String"
 
 
 def header(frame: str = "depth_camera_link") -> Any:
@@ -216,6 +217,10 @@ def rvl(values: np.ndarray) -> bytes:
 
 def number(value: float) -> Any:
     return types_of().types["std_msgs/msg/Float32"](data=value)
+
+
+def text(content: str) -> Any:
+    return types_of().types[TEXT](data=content)
 
 
 def write_ros1(

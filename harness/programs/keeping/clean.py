@@ -18,12 +18,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add("what", choices=("cache", "results"), help=what_help)
     name_help = "name of the results, as listed by tofpod ls results"
     add("name", nargs="?", default="", metavar="NAME[/DIGEST]", help=name_help)
-    add(
-        "--cache-limit",
-        type=bytes_of,
-        metavar="SIZE",
-        help="cache: remove the longest unused renders until the rest fits, such as 5GB (bare: GB)",
+    keep_help = (
+        "remove the longest unused renders, or the results that were written longest ago, until "
+        "the rest fits, such as 5GB (bare: GB)"
     )
+    add("--keep", type=bytes_of, metavar="SIZE", help=keep_help)
     add("--all", action="store_true", help="cache: remove all renders")
     add(
         "--results",
@@ -41,8 +40,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "Remove stored renders or results. Only files that tofpod wrote below --results are "
     "removed, links are never "
     "followed, and files of a running sweep are kept.",
-    "tofpod clean cache --cache-limit 5GB",
-    "tofpod clean results averaging --dry-run",
+    "tofpod clean cache --keep 5GB",
+    "tofpod clean results --keep 2GB --dry-run",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 1 if something could not be removed or the answer was no, 2 for
@@ -50,6 +49,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.keeping.listing import (
         cache_removal,
         chosen_results,
+        oldest_results,
         refuse_links,
         removable,
         remove_empty,
@@ -58,25 +58,24 @@ def main(options: argparse.Namespace, command: str) -> int:
     from scenes.render.cache import removed
 
     of_results = options.what == "results"
-    limit = options.cache_limit
-    if of_results and (limit is not None or options.all):
-        raise UserError(
-            "--cache-limit and --all are for the cache", legal="clean results NAME[/DIGEST]"
-        )
+    limit = options.keep
+    if of_results and options.all:
+        raise UserError("--all is for the cache", legal="clean results NAME[/DIGEST], or --keep")
     if options.name and not of_results:
         raise UserError(
             f"the cache has no part called {options.name!r}",
-            legal="clean cache --cache-limit SIZE, or --all",
+            legal="clean cache --keep SIZE, or --all",
         )
     if of_results:
-        folders = chosen_results(options.results, options.name)
-        print("\n".join(map(str, folders)))
+        if limit is None:
+            folders = chosen_results(options.results, options.name)
+        else:
+            folders = oldest_results(options.results, options.name, limit)
+        print("".join(f"{folder}\n" for folder in folders), end="")
     else:
         folders = [options.results / ".cache" / "renders"]
         if (limit is None) != options.all:
-            raise UserError(
-                "no renders are selected for removal", legal="--cache-limit SIZE, or --all"
-            )
+            raise UserError("no renders are selected for removal", legal="--keep SIZE, or --all")
         if not folders[0].is_dir():
             print(f"{folders[0]}: there is no cache")
             return 0

@@ -339,17 +339,13 @@ def _count_in(trials: Mapping[str, Any], name: str) -> int:
 def described(run: Path) -> dict[str, Any]:
     """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or
     broken."""
-    size_bytes = 0
-    for path in files_below(run):
-        with contextlib.suppress(OSError):
-            size_bytes += path.lstat().st_size
     row: dict[str, Any] = {
         "path": str(run),
         "experiment": run.parent.name,
         "digest": run.name,
         "state": "broken",
     }
-    row |= {"note": "", "size_bytes": size_bytes, "date": None}
+    row |= {"note": "", "size_bytes": folder_bytes(run), "date": None}
     try:
         facts = strict_json(bounded_bytes(run / PROVENANCE.name, TEXT_BYTES), nan=True)
         if not isinstance(facts, dict):
@@ -383,6 +379,21 @@ def described(run: Path) -> dict[str, Any]:
         note += f" (results version {version}, this tofpod writes {RESULTS_VERSION})"
     date = started[:40] if isinstance(started, str) and started.isprintable() else None
     return row | {"state": state, "note": note, "date": date}
+
+
+def results_bytes(out: Path) -> list[int]:
+    """Return the size of every results folder in bytes."""
+    parents = folders_in(out, EXPERIMENT_NAME)
+    return [folder_bytes(run) for parent in parents for run in folders_in(parent, DIGEST_NAME)]
+
+
+def folder_bytes(folder: Path) -> int:
+    """Return the size of all files below a folder; those that vanish meanwhile count nothing."""
+    size_bytes = 0
+    for path in files_below(folder):
+        with contextlib.suppress(OSError):
+            size_bytes += path.lstat().st_size
+    return size_bytes
 
 
 def in_use(run: Path) -> bool:
@@ -437,15 +448,42 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     refuse_links(parent, parent / digest)
     folders = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
     for folder in folders or [parent / digest]:
-        # every sweep first writes its declaration, whose first line identifies tofpod
-        declared = folder / EXPERIMENT.name
-        if not declared.is_file() or not bounded_bytes(declared, TEXT_BYTES).startswith(
-            b"# tofpod experiment "
-        ):
+        if not _is_declared(folder):
             raise UserError(
                 f"{folder}: is not a results folder", fix="see the list of tofpod ls results"
             )
     return folders
+
+
+def oldest_results(out: Path, experiment: str, limit_bytes: int) -> list[Path]:
+    """Return the results folders, of one experiment or ("") of all, to remove so that the rest
+    fits the limit: those written longest ago first. Folders of running sweeps stay, but count.
+    Raises UserError as `chosen_results` does for a named experiment."""
+    if experiment:
+        folders = chosen_results(out, experiment)
+    else:
+        parents = folders_in(out, EXPERIMENT_NAME)
+        inside = [folder for parent in parents for folder in folders_in(parent, DIGEST_NAME)]
+        folders = [folder for folder in inside if _is_declared(folder)]
+    wholes = []
+    for folder in folders:
+        files = removable(folder)
+        size_bytes = sum(file.size_bytes for file in files)
+        # looking into a folder writes its locks
+        times_s = [file.used_s for file in files if not LOCK_NAME.fullmatch(file.path.name)]
+        written_s = max(times_s, default=0.0)
+        wholes.append(StoredFile(folder, size_bytes, written_s))
+    running = [folder for folder in folders if in_use(folder)]
+    return [whole.path for whole in longest_unused(wholes, limit_bytes, running)]
+
+
+def _is_declared(folder: Path) -> bool:
+    """Return whether a folder holds a declaration, which every sweep writes first, and whose first
+    line identifies tofpod."""
+    declared = folder / EXPERIMENT.name
+    return declared.is_file() and bounded_bytes(declared, TEXT_BYTES).startswith(
+        b"# tofpod experiment "
+    )
 
 
 def removable(folder: Path) -> list[StoredFile]:

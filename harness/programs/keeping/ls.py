@@ -62,10 +62,18 @@ def main(options: argparse.Namespace, command: str) -> int:
 def _list_offers(options: argparse.Namespace) -> int:
     """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown
     name."""
-    from harness.programs.keeping.listing import SETTABLE, grid_of, offered, plug_ins, shown
+    from harness.programs.keeping.listing import (
+        SETTABLE,
+        grid_of,
+        offered,
+        plug_ins,
+        results_bytes,
+        shown,
+    )
     from harness.vocabulary.seeds import canonical_json
-    from harness.vocabulary.text import Grid, show
+    from harness.vocabulary.text import Grid, many, show
     from harness.vocabulary.words import nearest
+    from scenes.render.cache import stored_renders
 
     word = options.what
     name = options.name
@@ -75,6 +83,11 @@ def _list_offers(options: argparse.Namespace) -> int:
             return _print_json(rows)
         for kind, offers in rows.items():
             show([f"{kind} (entry points: {plug_ins(kind).group})", grid_of(kind, offers), ""])
+        if word is None:
+            print(_results_text(options.results, results_bytes(options.results)))
+            renders = stored_renders(options.results / ".cache" / "renders")
+            size = size_text(sum(file.size_bytes for file in renders))
+            print(f"cache: {many(len(renders), 'render')}, {size}; tofpod clean bounds both")
         return 0
     kinds_with_name = (
         [word]
@@ -123,7 +136,7 @@ def _list_results(options: argparse.Namespace) -> int:
         raise UserError(f"{options.results}: has no results of {options.name!r}", fix=fix)
     if options.json:
         return _print_json(folders)
-    print(f"results in {options.results}" + ("" if folders else ": none"))
+    print(_results_text(options.results, [run["size_bytes"] for run in folders]))
     for name in sorted({run["experiment"] for run in folders}):
         print(f"  {name}")
         shown = [run for run in folders if run["experiment"] == name]
@@ -139,6 +152,15 @@ def _list_results(options: argparse.Namespace) -> int:
             cells = (limit_text(run["limits"]), differs_text(run["differs"]))
             print("\n".join([f"    {line}", *(f"      {text}" for text in cells if text)]))
     return 0
+
+
+def _results_text(out: Path, sizes_bytes: list[int]) -> str:
+    """Return a line on the number of results folders and their size."""
+    from harness.vocabulary.text import many
+
+    if not sizes_bytes:
+        return f"results in {out}: none"
+    return f"results in {out}: {many(len(sizes_bytes), 'folder')}, {size_text(sum(sizes_bytes))}"
 
 
 def _list_cache(options: argparse.Namespace) -> int:

@@ -348,6 +348,19 @@ def test_realsense_names_and_its_unit(tmp_path: Path) -> None:
     assert recording.unit_text.startswith("depth unit 0.25 mm, from /device_0")
 
 
+def test_the_unit_of_realsense_in_a_bag_of_ros_2_is_a_text(tmp_path: Path) -> None:
+    sensor = "/device_0/sensor_0"
+    messages = [
+        (f"{sensor}/Depth_0/image/camera_info", bags.INFO, bags.info()),
+        (f"{sensor}/option/Depth_Units/description", bags.TEXT, bags.text("units of depth")),
+        (f"{sensor}/option/Depth_Units/value", bags.TEXT, bags.text("0.000100")),
+        (f"{sensor}/Depth_0/image/data", bags.IMAGE, bags.depth_image(10 * STORED, "mono16")),
+    ]
+    recording = open_capture([bags.write_bag(tmp_path / "bag", messages)])
+    assert recording.scale_m == 0.0001
+    np.testing.assert_allclose(np.nan_to_num(next(recording.frames()).z_m), STORED / 1e3, rtol=1e-6)
+
+
 def test_the_lens_of_a_camera_info() -> None:
     shape = plane.LENS.height, plane.LENS.width
     distorted = (0.1, -0.2, 0.001, 0.002, 0.03)

@@ -19,6 +19,7 @@ from harness.runs.jobs import Ended
 from harness.runs.journal import Journal
 from harness.runs.results_folder import latest_run, point_to
 from harness.runs.shards import locked
+from harness.vocabulary.files import size_text
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import RESULTS_VERSION
 from scenes.closed_form import plane_view
@@ -290,8 +291,8 @@ def left_in(folder: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("arguments", "kept"),
     [
-        (["--cache-limit", "0MB"], ""),
-        (["--cache-limit", "1GB"], "abc"),
+        (["--keep", "0MB"], ""),
+        (["--keep", "1GB"], "abc"),
         (["--all"], ""),
         (["--all", "--dry-run"], "abc"),
     ],
@@ -370,6 +371,57 @@ def test_results_go_and_what_is_not_tofpods_stays(tmp_path, capsys):
     (second / "notes.md").unlink()
 
 
+def written_days_ago(folder: Path, days: float) -> int:
+    """Set the time of all files of a folder. Returns their size."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    for path in files:
+        os.utime(path, (time.time() - days * DAY_S,) * 2)
+    return sum(path.stat().st_size for path in files)
+
+
+def test_the_oldest_results_go_until_the_rest_fits(tmp_path, capsys, monkeypatch):
+    oldest = results(tmp_path, "0" * 16, records=2, trials={"done": 2})
+    older = results(tmp_path, "1" * 16, records=2, name="wall", trials={"done": 2})
+    new = results(tmp_path, "2" * 16, records=2, trials={"done": 2})
+    stranger = tmp_path / "photos" / ("3" * 16)
+    stranger.mkdir(parents=True)
+    (stranger / "report.html").write_text("mine")
+    sizes = [written_days_ago(oldest, 9), written_days_ago(older, 5), written_days_ago(new, 1)]
+    kept_bytes = f"{(sizes[1] + sizes[2]) / 1e3}kB"
+    keep = ["results", "--results", str(tmp_path), "--keep"]
+    monkeypatch.setattr("sys.stdin", Terminal(is_there=False))
+    assert clean.main([*keep, kept_bytes]) == 2 and oldest.exists()
+    assert "cannot ask whether to remove" in capsys.readouterr().err
+    assert clean.main([*keep, kept_bytes, "--yes"]) == 0
+    assert not oldest.exists() and older.exists() and new.exists()
+    assert clean.main([*keep, kept_bytes, "--yes"]) == 0 and older.exists()
+    assert "nothing to remove" in capsys.readouterr().out
+    with locked(older):
+        assert clean.main([*keep, "0GB", "--yes"]) == 0
+    assert older.exists() and not new.exists()
+    assert (stranger / "report.html").read_text() == "mine"
+
+
+def test_the_oldest_results_of_one_experiment_go(tmp_path):
+    oldest = results(tmp_path, "0" * 16, name="wall", trials={"done": 2})
+    old = results(tmp_path, "1" * 16, trials={"done": 2})
+    new = results(tmp_path, "2" * 16, trials={"done": 2})
+    sizes = [written_days_ago(oldest, 9), written_days_ago(old, 5), written_days_ago(new, 1)]
+    keep = ["--keep", f"{sizes[2] / 1e3}kB", "--yes", "--results", str(tmp_path)]
+    assert clean.main(["results", "study", *keep]) == 0
+    assert oldest.exists() and new.exists() and not old.exists()
+
+
+def test_the_plain_list_ends_with_the_sizes_that_clean_bounds(cache, tmp_path, capsys):
+    folder = results(tmp_path, "0" * 16, records=2, trials={"done": 2})
+    size_bytes = written_days_ago(folder, 1)
+    assert ls.main(["--results", str(tmp_path)]) == 0
+    stored, renders = capsys.readouterr().out.splitlines()[-2:]
+    assert stored == f"results in {tmp_path}: 1 folder, {size_text(size_bytes)}"
+    cached_bytes = sum(path.stat().st_size for path in cache.glob("[abc]*.npz"))
+    assert renders.startswith(f"cache: 3 renders, {size_text(cached_bytes)};")
+
+
 def test_a_folder_that_only_looks_like_results_is_left_alone(tmp_path, capsys):
     stranger = tmp_path / "photos" / ("0" * 16)
     stranger.mkdir(parents=True)
@@ -413,7 +465,6 @@ def test_names_that_name_no_results(tmp_path, capsys, name):
     "arguments",
     [
         ["results", "study", "--all"],
-        ["results", "study", "--cache-limit", "1GB"],
         ["cache", "study", "--all"],
     ],
 )
