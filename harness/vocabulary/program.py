@@ -10,13 +10,13 @@ import math
 import os
 import re
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.lengths import LEGAL, in_unit, states_unit
 from harness.vocabulary.words import nearest
@@ -124,9 +124,7 @@ class Program:
         program, words = self.chosen_by(sys.argv[1:] if arguments is None else arguments)
         parsed = program.parser().parse_args(words)
         if arguments is None:
-            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
-            # does
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            system.end_as_by_interrupt()
             _limit_idle_threads()
         command = f"{program.command} {shlex.join(words)}".rstrip()
         return exit_code_of(lambda: program.run(parsed, command))
