@@ -121,13 +121,18 @@ class Program:
     def __call__(self, arguments: list[str] | None = None) -> int:
         """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
         Ctrl-C."""
-        program, words = self.chosen_by(sys.argv[1:] if arguments is None else arguments)
-        parsed = program.parser().parse_args(words)
+        words = sys.argv[1:] if arguments is None else arguments
         if arguments is None:
             system.end_as_by_interrupt()
             _limit_idle_threads()
-        command = f"{program.command} {shlex.join(words)}".rstrip()
-        return exit_code_of(lambda: program.run(parsed, command))
+        return exit_code_of(lambda: self._answer(words))
+
+    def _answer(self, words: list[str]) -> int:
+        """Run the program that the arguments name, or print its help."""
+        program, arguments = self.chosen_by(words)
+        parsed = program.parser().parse_args(arguments)
+        command = f"{program.command} {shlex.join(arguments)}".rstrip()
+        return program.run(parsed, command)
 
 
 def _limit_idle_threads() -> None:

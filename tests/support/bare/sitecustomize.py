@@ -1,7 +1,7 @@
 """Takes away what Linux has and Windows lacks: with this folder first in PYTHONPATH, Python imports
 this file at its start, in each process.
 
-No `fcntl` and `resource`; no fork; no /proc; no links; no `poll`, masks of signals and SIGUSR1; a
+No `fcntl` and `resource`; no fork; no /proc; no links, if WITHOUT_LINKS is set; no `poll`, masks of signals and SIGUSR1; a
 file that is open can neither be removed nor renamed over, and is flushed only if it is open for
 writing. A stand-in for `msvcrt` locks as Windows does: for a single open file, without waiting."""
 
@@ -22,6 +22,8 @@ import types
 from typing import Any
 
 flags_of = fcntl.fcntl
+# threadpoolctl reads this; it has a way of its own on each system
+OF_A_LIBRARY = "/proc/self/maps"
 LOCK_FORMAT = "hhqqi"  # struct flock of Linux
 
 
@@ -48,14 +50,15 @@ def refuse_open_file(path: Any) -> None:
 
 def watch(event: str, arguments: tuple[Any, ...]) -> None:
     """Refuse what Windows refuses."""
-    if event == "open" and str(arguments[0]).startswith("/proc/"):
+    path = str(arguments[0]) if event == "open" else ""
+    if path.startswith("/proc/") and path != OF_A_LIBRARY:
         raise FileNotFoundError(errno.ENOENT, "there is no /proc", arguments[0])
     if event == "os.remove":
         refuse_open_file(arguments[0])
     if event == "os.rename":
         refuse_open_file(arguments[0])
         refuse_open_file(arguments[1])
-    if event == "os.symlink":
+    if event == "os.symlink" and "WITHOUT_LINKS" in os.environ:
         raise OSError(errno.EPERM, "a link needs a privilege")
 
 
@@ -83,6 +86,8 @@ sys.modules["fcntl"] = None  # type: ignore[assignment]
 sys.modules["resource"] = None  # type: ignore[assignment]
 multiprocessing.get_all_start_methods = spawn_only
 multiprocessing.context.DefaultContext.get_all_start_methods = spawn_only  # type: ignore[method-assign]
+default: Any = multiprocessing.context._default_context  # type: ignore[attr-defined]
+default._default_context = multiprocessing.get_context("spawn")
 for method in ("fork", "forkserver"):
     del multiprocessing.context._concrete_contexts[method]  # type: ignore[attr-defined]
 os.fsync = fsync_of_written
