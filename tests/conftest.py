@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import os
 from collections.abc import Callable, Generator
@@ -105,8 +104,10 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     base = factory.getbasetemp()
     home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"shared-{name}"
     home.mkdir(exist_ok=True)
-    with (home / "lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    from harness.vocabulary import system
+
+    with (home / "lock").open("ab") as lock:
+        system.lock(lock, shared=False, wait=True)
         if not (home / "made").exists():
             make(home)
             (home / "made").touch()

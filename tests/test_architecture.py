@@ -223,6 +223,27 @@ def test_drawing_is_imported_where_something_is_drawn():
             assert not any(name.split(".")[0] == "matplotlib" for name in names), path
 
 
+OF_A_PLATFORM = {"fcntl", "resource", "signal", "select", "msvcrt", "multiprocessing"}
+"""Modules that differ between operating systems; the type of a pipe's end does not."""
+
+
+def test_only_one_module_asks_for_the_operating_system():
+    for path in sources():
+        if path == ROOT / "harness" / "vocabulary" / "system.py":
+            continue
+        for node in nodes(path):
+            imported = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                imported = [node.module or ""]
+            for name in set(imported) - {"multiprocessing.connection"}:
+                assert name.split(".")[0] not in OF_A_PLATFORM, path
+            if isinstance(node, ast.Attribute):
+                asked = ast.unparse(node)
+                assert asked not in ("sys.platform", "os.name", "os.fork", "os.kill"), path
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert not node.value.startswith(("/proc/", "/dev/")), path
+
+
 def test_class_names_have_one_meaning():
     homes: dict[str, list[str]] = {}
     for path in sources():

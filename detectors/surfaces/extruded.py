@@ -453,7 +453,9 @@ def explains_better(
     return _gain_sigmas(profile, smooth, points, rounding_m) > GAIN_SIGMAS
 
 
-def _gain_sigmas(profile: Profile, smooth: Fit, points: np.ndarray, rounding_m: float) -> float:
+def _gain_sigmas(
+    profile: Profile, smooth: SurfaceFunction, points: np.ndarray, rounding_m: float
+) -> float:
     """Return by how many of its standard errors an extruded surface explains points (n, 3) better
     than a ``smooth`` one; -inf where too little departs from the smooth one to tell.
 

@@ -1,8 +1,10 @@
 """Declares the files that programs write into a results folder, for `tofpod clean` and
 `results/README.md`."""
 
+import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 FolderKind = Literal["results", "capture"]
@@ -104,4 +106,23 @@ FILES = (
 )
 JOURNAL = "journal"
 LATEST = "latest"
+"""A link to the newest run; a text file with its name where the system has no links."""
+RUN_NAME = re.compile(r"[0-9a-f]{16}")
 LOCK_NAME = re.compile(r"\.lock(-[0-9]+-of-[0-9]+)?")
+
+
+def run_named_by(latest: Path) -> str | None:
+    """Return the name of the run that the link or text file ``latest`` points to; None if it is
+    neither, or not tofpod's."""
+    try:
+        name = os.readlink(latest) if latest.is_symlink() else latest.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None
+    return name if RUN_NAME.fullmatch(name) else None
+
+
+def run_at(path: Path) -> Path:
+    """Return a path, with a text file ``latest`` replaced by the folder that it names."""
+    if path.name == LATEST and path.is_file():
+        return path.with_name(run_named_by(path) or LATEST)
+    return path

@@ -3,16 +3,15 @@ it ended."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import DiskFull, UserError
 
 if TYPE_CHECKING:
@@ -153,8 +152,7 @@ class Limits:
 def attempt(job: Job, worker: str) -> Ended:
     """Run a job in this process; an exception becomes its end. If the process dies, the engine has
     to notice."""
-    with contextlib.suppress(OSError):  # reset the peak of memory (Linux)
-        Path("/proc/self/clear_refs").write_text("5")
+    system.reset_peak_memory()
     began = time.monotonic()
     state: State = "failed"
     value = None
@@ -177,10 +175,5 @@ def attempt(job: Job, worker: str) -> Ended:
         why = "".join(traceback.format_exception(error))[-TRACEBACK_CHARACTERS:]
         is_bug = True
     seconds = time.monotonic() - began
-    peak_mb = 0.0
-    with contextlib.suppress(OSError, ValueError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM"):
-                peak_kib = int(line.split()[1])
-                peak_mb = round(peak_kib * 1024 / 1e6, 1)
+    peak_mb = round(system.peak_memory_bytes() / 1e6, 1)
     return Ended(state, value, why, is_bug, seconds, peak_mb, worker, ends_all)

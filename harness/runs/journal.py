@@ -140,7 +140,7 @@ class Journal:
     def sync(self) -> None:
         """Flush this process's entries to the disk, so that a power failure does not lose them."""
         if self._own is not None:
-            with suppress(OSError), open_plain(self._own, os.O_RDONLY) as file:
+            with suppress(OSError), open_plain(self._own, os.O_WRONLY) as file:
                 os.fsync(file.fileno())
 
     def refresh(self) -> None:

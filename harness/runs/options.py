@@ -89,7 +89,7 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="time that one trial or render may take (default: 900)",
     )
-    memory = "memory that a trial's process may use, also on a cluster (default: 4GB)"
+    memory = "memory that a trial's process may use, also on a cluster (Linux; default: 4GB)"
     add("--memory-limit", type=_gigabytes, default=4.0, metavar="SIZE", help=memory)
     cache = "size of all stored renders; the least recently used are removed first (default: 20GB)"
     add("--cache-limit", type=_gigabytes, default=20.0, metavar="SIZE", help=cache)

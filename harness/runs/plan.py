@@ -7,7 +7,6 @@ of some repeats, which shards share out."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -57,7 +56,8 @@ PACKAGES = (
     "scipy",
     "numba",
     "opencv-python-headless",
-    "open3d-cpu" if sys.platform == "linux" else "open3d",
+    "open3d-cpu",
+    "open3d",
 )
 """A trial runs again after a change of its task, of sources that it reaches, or of a version of
 these packages."""

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import gc
 import importlib
-import multiprocessing
 import os
 import pickle
 import queue
-import signal
 import sys
 import tempfile
 import threading
@@ -23,12 +20,12 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
 
 from harness.runs.jobs import TRACEBACK_CHARACTERS, Code, Ended, Job, Limits, Stage, attempt
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.provenance import (
     first_content,
@@ -52,78 +49,27 @@ IDLE_S: dict[Stage, float] = {
     "trials": 300.0,
     "renders": 10.0,
 }  # idle processes end then; renderers hold 2 GB
-MOST_FILES = 4096  # numbers of open files that a fork closes
 FALSE_STARTS = 3  # give up after this many processes in a row died before they could take a job
 _STARTING = threading.Lock()
-CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
-PROCESSES: Any = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
-"""Processes fork from a small server process that has imported what each of them would need a
-second to import."""
+PROCESSES = system.forked_processes()
 TRIALS = "harness.trials.trial"
 RENDERS = "scenes.render.view"
 """What processes for trials and for renders need; the latter loads SciPy's statistics."""
 NOT_TO_FORK = ("drjit", "open3d")
 """Packages that a process must load in their order (`scenes.render.scene`), and by itself."""
 
-SAFE_THREADS = ("jemalloc_bg_thd",)
-"""Threads that prepare their locks for a fork: that of PyArrow's allocator."""
-
 
 def start_server(preloaded: Sequence[str]) -> None:
-    """Start the server process with these modules, unless it runs. If it is safe, it is a fork of
-    this process, which saves the 1.5 s of processor time in which another interpreter imports the
-    same modules."""
-    if not CAN_FORK:
-        return
-    from multiprocessing import forkserver, resource_tracker
-
-    util: Any = importlib.import_module("multiprocessing.util")
+    """Start the server process of `PROCESSES` with these modules, unless it runs or there is
+    none."""
     with _starting():
-        PROCESSES.set_forkserver_preload(list(preloaded))
-        if not _is_safe_to_fork():
-            forkserver.ensure_running()
-            return
-        for module in preloaded:
-            importlib.import_module(module)
-        resource_tracker.ensure_running()
-        spawned = util.spawnv_passfds
-        util.spawnv_passfds = _forked
-        try:
-            forkserver.ensure_running()
-        finally:
-            util.spawnv_passfds = spawned
+        system.start_fork_server(preloaded, NOT_TO_FORK, _forget_sources)
 
 
-def _is_safe_to_fork() -> bool:
-    """Return whether a fork of this process can do all that a new one can: another thread might
-    hold a lock, which stays locked in the fork. On macOS, system libraries do not survive it."""
-    if sys.platform != "linux" or any(name in sys.modules for name in NOT_TO_FORK):
-        return False
-    names = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
-    return len([name for name in names if name not in SAFE_THREADS]) == 1
-
-
-def _forked(path: bytes, arguments: Sequence[Any], kept_files: Sequence[int]) -> int:
-    """Start the server process as a fork, in place of `multiprocessing.util.spawnv_passfds`: the
-    last of the arguments is the program that a new interpreter would run. Return its number."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    number = os.fork()
-    if number:
-        return number
-    try:
-        gc.freeze()  # what is never collected stays shared with this process
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        for first, last in pairwise([2, *sorted(kept_files), MOST_FILES]):
-            os.closerange(first + 1, last)
-        # as in a new process: its forks see sources as they are when they start
-        for known in (source_digest, reached_sources, imported_sources, first_content):
-            known.cache_clear()
-        exec(arguments[-1], {})
-    except Exception:
-        traceback.print_exc()
-    finally:
-        os._exit(0)
+def _forget_sources() -> None:
+    """Let forks see sources as they are when they start, as new processes do."""
+    for known in (source_digest, reached_sources, imported_sources, first_content):
+        known.cache_clear()
 
 
 @dataclass(eq=False)
@@ -362,12 +308,10 @@ class _Worker(threading.Thread):
                 spent_s = waits_s
             left_s -= spent_s
         where = "a place that is not known"
-        with contextlib.suppress(OSError, AttributeError):
-            os.kill(
-                self._process.pid, signal.SIGUSR1
-            )  # its own signal handler writes the traceback
+        with contextlib.suppress(OSError):
+            system.ask_for_stack(self._process.pid)
             time.sleep(DUMP_S)
-            where = self._trace.read_text()[-TRACEBACK_CHARACTERS:]
+            where = self._trace_text() or where
         why = f"not done after {limit_s:.3g} s (--time-limit); it was at:\n{where}"
         return Ended("timed out", why=why, seconds=time.monotonic() - began, worker=self._label)
 
@@ -376,18 +320,13 @@ class _Worker(threading.Thread):
         if self._process is None:
             return "the process that it forks from has died"
         self._process.join(timeout=1.0)
-        code = self._process.exitcode
-        why = f"its process exited with code {code}"
-        if code is not None and code < 0:
-            name = (
-                signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-            )
-            cause = (
-                ": by a user, or by the system because memory ran out" if name == "SIGKILL" else ""
-            )
-            why = f"its process was ended by {name}{cause}"
-        trace = self._trace.read_text()[-TRACEBACK_CHARACTERS:] if self._trace.exists() else ""
+        why = system.cause_of_end(self._process.exitcode)
+        trace = self._trace_text() if self._trace.exists() else ""
         return why + (f"\n{trace}" if trace else "")
+
+    def _trace_text(self) -> str:
+        """Return the end of what the process wrote of its crash or hang."""
+        return self._trace.read_text(encoding="utf-8")[-TRACEBACK_CHARACTERS:]
 
     def strike(self) -> None:
         """Kill the process without waiting; from any thread."""
@@ -419,22 +358,10 @@ def _environment(stated: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon. The server
-    process finds modules where this process does, not first in the folder in which it starts."""
-    config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
-    started_in = multiprocessing.process.ORIGINAL_DIR  # type: ignore[attr-defined]
-    search_path = os.pathsep.join(path or started_in for path in sys.path)
-    with _STARTING, _environment(ONE_THREAD | {"PYTHONPATH": search_path, "PYTHONSAFEPATH": "1"}):
-        daemon = config.get("daemon")
-        config["daemon"] = False
-        has_masks = hasattr(signal, "pthread_sigmask")
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()
-        try:
-            yield
-        finally:
-            config["daemon"] = daemon
-            if has_masks:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    """Start processes that ignore Ctrl-C, even from a dask worker, which is a daemon."""
+    found = {"PYTHONPATH": system.search_path(), "PYTHONSAFEPATH": "1"}
+    with _STARTING, _environment(ONE_THREAD | found), system.starting_processes():
+        yield
 
 
 # ---------------------------------------------------------------- in the process
@@ -471,7 +398,7 @@ def serve(
     with contextlib.suppress(EOFError, OSError):
         while True:
             job, memory_mb = pipe.recv()
-            _limit_memory(memory_mb)
+            system.limit_private_memory(None if memory_mb is None else memory_mb * 1_000_000)
             began_s = time.process_time()
             ended = attempt(job, name)
             ended = replace(ended, processor_s=time.process_time() - began_s)
@@ -491,32 +418,12 @@ def serve(
 def _prepare(trace: str) -> IO[str]:
     """Ignore Ctrl-C, end together with the driver, and write where a crash or hang occurs to the
     file ``trace``."""
-    # On POSIX this process ends with its driver, whatever it does, because a pipe without a writer
-    # sends SIGIO. On Windows it ends when it next reads from or writes to the pipe.
-    with contextlib.suppress(ImportError, AttributeError, OSError):
-        import fcntl
-
-        drivers_end = multiprocessing.parent_process().sentinel  # type: ignore[union-attr]
-        fcntl.fcntl(drivers_end, fcntl.F_SETOWN, os.getpid())
-        fcntl.fcntl(
-            drivers_end, fcntl.F_SETFL, fcntl.fcntl(drivers_end, fcntl.F_GETFL) | os.O_ASYNC
-        )
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    file = open(trace, "w")  # noqa: SIM115 (open as long as the process lives)
+    system.end_with_parent()
+    system.ignore_interrupts()
+    file = open(trace, "w", encoding="utf-8")  # noqa: SIM115 (open as long as the process lives)
     faulthandler.enable(file)
-    if hasattr(faulthandler, "register"):
-        faulthandler.register(signal.SIGUSR1, file, all_threads=False)
+    system.dump_stack_when_asked(file)
     return file
-
-
-def _limit_memory(memory_mb: int | None) -> None:
-    """Make allocations fail beyond this much private memory of the process (Linux only)."""
-    with contextlib.suppress(ImportError, ValueError, OSError):
-        import resource
-
-        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        soft = hard if memory_mb is None else memory_mb * 1_000_000
-        resource.setrlimit(resource.RLIMIT_DATA, (soft if hard < 0 else min(soft, hard), hard))
 
 
 def render_into_cache(

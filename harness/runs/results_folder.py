@@ -7,10 +7,12 @@ import secrets
 import sys
 from pathlib import Path
 
-from harness.records.outputs import LATEST
+from harness.records.outputs import LATEST, run_named_by
+from harness.vocabulary import system
+from harness.vocabulary.errors import UserError
+from harness.vocabulary.files import write_text
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-DIGEST_NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
@@ -26,16 +28,14 @@ def folders_in(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def latest_run(parent: Path) -> str | None:
-    """Return the name of the run to which ``parent/latest`` points; None without a link that
-    tofpod made."""
-    path = Path(parent) / LATEST
-    target = os.readlink(path) if path.is_symlink() else ""
-    return target if DIGEST_NAME.fullmatch(target) else None
+    """Return the name of the run to which ``parent/latest`` points; None if tofpod did not make
+    that."""
+    return run_named_by(Path(parent) / LATEST)
 
 
 def point_to(run: Path) -> None:
-    """Point the link ``latest`` beside a run to it, unless somebody else made the link; print
-    failures to stderr."""
+    """Point ``latest`` beside a run to it, unless somebody else made that; print failures to
+    stderr."""
     path = Path(run).parent / LATEST
     if os.path.lexists(path) and latest_run(path.parent) is None:
         print(
@@ -43,9 +43,18 @@ def point_to(run: Path) -> None:
             file=sys.stderr,
         )
         return
+    try:
+        _point(path, Path(run).name)
+    except (OSError, UserError) as error:
+        print(f"{path}: cannot be created ({error}); the newest run is {run}", file=sys.stderr)
+
+
+def _point(path: Path, name: str) -> None:
+    """Make ``path`` a link to a name beside it, or a text where the system has no links."""
     part = path.with_name(f".{LATEST}.{secrets.token_hex(4)}.part")
     try:
-        os.symlink(Path(run).name, part)
-        os.replace(part, path)
-    except (OSError, NotImplementedError) as error:
-        print(f"{path}: cannot be created ({error}); the newest run is {run}", file=sys.stderr)
+        os.symlink(name, part)
+    except (OSError, NotImplementedError):  # Windows, but for developers; some file systems
+        write_text(path, name)
+        return
+    system.replace(part, path)

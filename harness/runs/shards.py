@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import lock, opened_lock
+from harness.vocabulary.files import opened_lock
 
 T = TypeVar("T")
 MOST = 100_000
@@ -76,7 +77,7 @@ def locked(folder: Path, shard: Shard = WHOLE) -> Iterator[None]:
 @contextlib.contextmanager
 def _held(path: Path, *, shared: bool) -> Iterator[None]:
     with opened_lock(path) as file:
-        answer = lock(file, shared=shared, wait=False)
+        answer = system.lock(file, shared=shared, wait=False)
         if answer == "busy":
             message = f"{path.parent}: another sweep is running in this folder"
             raise UserError(message, fix="wait for it, or name another folder with --out")

@@ -2,14 +2,12 @@
 its traceback."""
 
 import errno
-import io
 import os
-import select
-import signal
 import sys
-import threading
 from collections.abc import Callable
 from functools import partial
+
+from harness.vocabulary import system
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """Error numbers of a place that takes no more: a full disk or device, a quota, a file's limit."""
@@ -44,31 +42,19 @@ def exit_code_of(program: Callable[[], int]) -> int:
     """Run a program's body and return its exit code. A UserError gives one message on stderr and
     code 2, as does a standard output that is full. Ctrl-C gives 130, and a closed output pipe
     (``| head``) silently gives 141. Further Ctrl-C are ignored during the shutdown."""
-    owns_interrupt = threading.current_thread() is threading.main_thread()
-    owns_interrupt = (
-        owns_interrupt and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
+    system.replace_unknown_characters()
+    with system.one_interrupt():
+        return _exit_code_of(program)
 
-    def interrupt(number: int, frame: object) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        raise KeyboardInterrupt
 
-    if owns_interrupt:
-        signal.signal(signal.SIGINT, interrupt)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(
-                errors="replace"
-            )  # a terminal that lacks a character such as "±" shows "?"
+def _exit_code_of(program: Callable[[], int]) -> int:
     try:
         code = program()
         sys.stdout.flush()
         return code
-    except BrokenPipeError:
-        if not _nobody_reads():
-            raise
-        return CLOSED_PIPE
     except OSError as error:
+        if system.is_closed_pipe(error) and _nobody_reads():
+            return CLOSED_PIPE
         if error.errno not in FULL or not _is_output_full():
             raise
         reason = os.strerror(error.errno).lower()
@@ -82,9 +68,6 @@ def exit_code_of(program: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    finally:
-        if owns_interrupt:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _is_output_full() -> bool:
@@ -115,11 +98,9 @@ def _nobody_reads() -> bool:
     """Return whether the closed pipe is that of the standard output."""
     try:
         output = sys.stdout.fileno()
-        poll = select.poll()
     except (OSError, ValueError):
         return False
-    poll.register(output, 0)
-    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+    if not system.has_no_reader(output):
         return False
     _send_nowhere(output)
     return True

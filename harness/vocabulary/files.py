@@ -12,13 +12,13 @@ import shutil
 import stat
 import sysconfig
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import DiskFull, UserError
 
 # A frame, picture or cloud: sixty times the largest depth sensor; 1.5 GB as points
@@ -92,43 +92,12 @@ def shipped(kind: str) -> Path:
     )
 
 
-_LOCK = threading.Lock()
-_WANTED = list[int]()
-_BEFORE = list[tuple[int, int]]()
-"""The limits that active `limited_memory` contexts request, and the process's own limit before the
-first of them."""
-
-
 @contextmanager
 def limited_memory() -> Iterator[None]:
-    """Limit the additional memory of the process to `READING_BYTES`; an excess raises MemoryError.
-    The limit (RLIMIT_AS) holds for all threads; the lowest of several counts. Systems without it
-    or /proc set no limit."""
-    try:
-        import resource
-
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    except (ImportError, OSError):
+    """Limit the additional memory of the process to `READING_BYTES`, where the system can; an
+    excess raises MemoryError."""
+    with system.limited_memory(READING_BYTES):
         yield
-        return
-    wanted = pages * resource.getpagesize() + READING_BYTES
-
-    def set_least() -> None:
-        soft, hard = _BEFORE[0]
-        limits = [limit for limit in (*_WANTED, soft, hard) if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(resource.RLIMIT_AS, (min(limits, default=resource.RLIM_INFINITY), hard))
-
-    with _LOCK:
-        if not _WANTED:
-            _BEFORE[:] = [resource.getrlimit(resource.RLIMIT_AS)]
-        _WANTED.append(wanted)
-        set_least()
-    try:
-        yield
-    finally:
-        with _LOCK:
-            _WANTED.remove(wanted)
-            set_least()
 
 
 def strict_json(content: bytes | str, *, nan: bool = False) -> Any:
@@ -184,8 +153,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     with _renamed(path, make, 0o666) as temporary:
         yield temporary
         if durable:
-            with open(temporary, "rb") as written:
-                os.fsync(written.fileno())
+            system.flush_to_disk(temporary)
 
 
 @contextmanager
@@ -220,7 +188,7 @@ def _renamed(path: Path, make: Callable[[], str], mode: int) -> Iterator[Path]:
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(mode & ~umask)
-        os.replace(temporary, path)
+        system.replace(temporary, path)
     except OSError as error:
         raise explained(error, path) from error
     finally:
@@ -268,10 +236,7 @@ def open_plain(path: Path, flags: int) -> IO[bytes]:
     )
     if path.is_symlink() or path.is_dir():
         raise irregular
-    flags |= (
-        getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    )
-    descriptor = os.open(path, flags, 0o666)
+    descriptor = os.open(path, flags | system.flags_of_plain_file(), 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise irregular
@@ -299,47 +264,21 @@ def explained(error: OSError, path: Path) -> Exception:
     return error
 
 
-Answer = Literal[
-    "held", "busy", "no locks"
-]  # busy: held by another process; no locks: Windows, some file systems
-
-
 def opened_lock(path: Path) -> IO[bytes]:
     """Open a lock file; create it if it is missing. Raises OSError, or UserError if it is not a
     regular file."""
     return open_plain(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
 
 
-def lock(file: IO[bytes], *, shared: bool, wait: bool) -> Answer:
-    """Lock an open file until it is closed; return whether the lock is held."""
-    try:
-        import fcntl
-    except ImportError:
-        return "no locks"
-    try:
-        fcntl.flock(
-            file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB)
-        )
-    except BlockingIOError:
-        return "busy"
-    except OSError:
-        return "no locks"
-    return "held"
-
-
 @contextmanager
 def one_at_a_time(path: Path, number: int) -> Iterator[None]:
     """Lock byte ``number`` of a lock file against other processes, if the system supports locks."""
     try:
-        import fcntl
-
         file = opened_lock(path)
-    except (ImportError, OSError):
+    except OSError:
         yield
         return
-    with file:
-        with suppress(OSError):  # a file system without locks
-            fcntl.lockf(file, fcntl.LOCK_EX, 1, number)
+    with file, system.locked_byte(file, number):
         yield
 
 

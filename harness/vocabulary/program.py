@@ -10,13 +10,13 @@ import math
 import os
 import re
 import shlex
-import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError, exit_code_of
 from harness.vocabulary.lengths import LEGAL, in_unit, states_unit
 from harness.vocabulary.words import nearest
@@ -121,15 +121,18 @@ class Program:
     def __call__(self, arguments: list[str] | None = None) -> int:
         """Run the program. Returns the result of ``run``, 2 after a user's mistake, or 130 after
         Ctrl-C."""
-        program, words = self.chosen_by(sys.argv[1:] if arguments is None else arguments)
-        parsed = program.parser().parse_args(words)
+        words = sys.argv[1:] if arguments is None else arguments
         if arguments is None:
-            # batch systems and containers first send SIGTERM, which must end the program as Ctrl-C
-            # does
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            system.end_as_by_interrupt()
             _limit_idle_threads()
-        command = f"{program.command} {shlex.join(words)}".rstrip()
-        return exit_code_of(lambda: program.run(parsed, command))
+        return exit_code_of(lambda: self._answer(words))
+
+    def _answer(self, words: list[str]) -> int:
+        """Run the program that the arguments name, or print its help."""
+        program, arguments = self.chosen_by(words)
+        parsed = program.parser().parse_args(arguments)
+        command = f"{program.command} {shlex.join(arguments)}".rstrip()
+        return program.run(parsed, command)
 
 
 def _limit_idle_threads() -> None:

@@ -29,6 +29,7 @@ PACKAGES = (
     "numba",
     "pandas",
     "open3d-cpu",
+    "open3d",
     "opencv-python-headless",
 )
 

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import lock, one_at_a_time, opened_lock, write_bytes
+from harness.vocabulary.files import one_at_a_time, opened_lock, write_bytes
 from harness.vocabulary.geometry import Region
 from harness.vocabulary.provenance import source_digest
 from harness.vocabulary.seeds import digest
@@ -228,7 +229,7 @@ def in_use(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(opened_lock(folder / LOCK))
-            lock(
+            system.lock(
                 file,
                 shared=True,
                 wait=True,
@@ -248,7 +249,7 @@ def alone(folder: Path) -> Iterator[None]:
                 f"{folder}: cannot be written ({error.strerror})", fix="ask its owner"
             ) from error
         if (
-            lock(
+            system.lock(
                 file,
                 shared=False,
                 wait=False,

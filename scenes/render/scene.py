@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.extras import load_extra
 from scenes.optics import Optics
@@ -61,7 +62,7 @@ def load_mitsuba() -> Any:
 def _works(mi: Any, name: str) -> bool:
     """Return whether the variant finds a ray's hit. A GPU whose driver lacks OptiX computes, but
     casts no rays."""
-    if name not in mi.variants() or (name.startswith("cuda") and not _has_nvidia_driver()):
+    if name not in mi.variants() or (name.startswith("cuda") and not system.has_nvidia_driver()):
         return False
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -74,16 +75,6 @@ def _works(mi: Any, name: str) -> bool:
             # Dr.Jit reports a missing backend by various exceptions; any of them means that this
             # variant does not work
             return False
-
-
-def _has_nvidia_driver() -> bool:
-    """Return whether there is an NVIDIA driver. Without it, Dr.Jit prints warnings that look like
-    errors to a user."""
-    return (
-        Path("/proc/driver/nvidia/version").exists()
-        or Path("/dev/nvidiactl").exists()
-        or sys.platform == "win32"
-    )
 
 
 def _point_to_llvm() -> UserError | None:

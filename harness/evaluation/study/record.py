@@ -24,6 +24,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
+from harness.records.outputs import run_at
 from harness.vocabulary.declaration.diagnose import shown
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
@@ -400,7 +401,9 @@ def read_record(path: Path) -> StudyRecord:
     """Read the record at ``path``: a file, or a result folder with its ``study.json``. Raises
     UserError if there is none, if it is not a record or is damaged (with set-up and field), and if
     it has another version."""
-    file = Path(path) / "study.json" if Path(path).is_dir() else Path(path)
+    file = run_at(Path(path))
+    if file.is_dir():
+        file = file / "study.json"
     try:
         # NaN is allowed in the record's columns
         data = strict_json(bounded_bytes(file, RECORD_BYTES), nan=True)

@@ -490,7 +490,7 @@ def examine(code: Mapping[Stage, Code], probe: str, dask_worker: Any) -> NodeFac
     offers_render = state.total_resources.get("render", 0) > 0
     sees = None
     with contextlib.suppress(OSError):
-        sees = Path(probe).read_text()
+        sees = Path(probe).read_text(encoding="utf-8")
     return NodeFacts(platform.python_version(), digests, state.nthreads, offers_render, sees)
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Frame, FrameSource, Lens, Reason, Region, invert
 
@@ -130,7 +131,6 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
         raise UserError("the TUM RGB-D layout allows a single lens, but these views have several")
     for name in ("rgb", "depth"):
         (folder / name).mkdir()
-        (folder / f"{name}_sync").symlink_to(name, target_is_directory=True)
     lines: dict[str, list[str]] = {
         "rgb.txt": ["# color images", "# timestamp filename"],
         "depth.txt": ["# depth maps, 5000 to the metre, 0: none", "# timestamp filename"],
@@ -152,6 +152,8 @@ def write_tum(folder: Path, views: Sequence[ExportedView]) -> None:
             lines["groundtruth.txt"].append(f"{time} {pose_text}")
     for name, text in lines.items():
         (folder / name).write_text("\n".join((*text, "")), encoding="utf-8")
+    for name in ("rgb", "depth"):
+        system.link_or_copy(folder / name, folder / f"{name}_sync")
     (folder / CALIBRATION).write_text(calibration_text(lens), encoding="utf-8")
 
 

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from harness.records.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY
+from harness.records.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY, run_at
 from harness.runs.engines import engine_of
 from harness.runs.options import add_engine_options, engine_options
 from harness.runs.shards import locked
@@ -54,7 +54,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     run_options = engine_options(options)
     if not run_options.shard.is_whole:
         raise UserError("--shard: efficiency needs the whole study", fix="leave it out")
-    folder = options.results.resolve()
+    folder = run_at(options.results).resolve()
     recorded = read_record(folder)
     at_stated_values = tuple(set_up for set_up in recorded.set_ups if not set_up.drawn)
     study = replace(recorded, set_ups=at_stated_values)

@@ -96,6 +96,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         return 0 if options.dry_run or not wanted else 1
     with _held(folders, of_results):  # not held during the question, which would block every sweep
         gone = removed(wanted)
+    # Windows removes no lock while it is held
+    gone += removed(file for file in wanted if file not in gone)
     for folder in folders if of_results else ():
         remove_empty(folder)
         if folder.exists():

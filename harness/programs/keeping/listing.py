@@ -17,10 +17,11 @@ from pydantic import ValidationError
 from detectors import DETECTORS, detector_type, load_detector
 from detectors.filters import FILTERS, filter_settings_type, load_filter
 from harness.programs.keeping.written_files import is_output
-from harness.records.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE
+from harness.records.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, RUN_NAME
 from harness.runs.journal import SEGMENT_NAME, Journal
-from harness.runs.results_folder import DIGEST_NAME, EXPERIMENT_NAME, folders_in, latest_run
+from harness.runs.results_folder import EXPERIMENT_NAME, folders_in, latest_run
 from harness.runs.shards import LOCK
+from harness.vocabulary import system
 from harness.vocabulary.declaration.shape import (
     Declared,
     default_at,
@@ -32,7 +33,7 @@ from harness.vocabulary.declaration.shape import (
 )
 from harness.vocabulary.declaration.yaml_source import read_yaml
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, lock, opened_lock, strict_json
+from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, opened_lock, strict_json
 from harness.vocabulary.path_names import names_of, value_text
 from harness.vocabulary.plug_ins import Offer, PlugIns
 from harness.vocabulary.provenance import RESULTS_VERSION
@@ -248,7 +249,7 @@ def result_folders(out: Path, experiment: str | None = None) -> list[dict[str, A
     for parent in folders_in(out, EXPERIMENT_NAME):
         if experiment is not None and parent.name != experiment:
             continue
-        runs = folders_in(parent, DIGEST_NAME)
+        runs = folders_in(parent, RUN_NAME)
         settings = {run: _settings(run) for run in runs} if len(runs) > 1 else {}
         known_settings = [setting for setting in settings.values() if setting]
         paths = dict.fromkeys(path for setting in known_settings for path in setting)
@@ -384,7 +385,7 @@ def described(run: Path) -> dict[str, Any]:
 def results_bytes(out: Path) -> list[int]:
     """Return the size of every results folder in bytes."""
     parents = folders_in(out, EXPERIMENT_NAME)
-    return [folder_bytes(run) for parent in parents for run in folders_in(parent, DIGEST_NAME)]
+    return [folder_bytes(run) for parent in parents for run in folders_in(parent, RUN_NAME)]
 
 
 def folder_bytes(folder: Path) -> int:
@@ -402,7 +403,7 @@ def in_use(run: Path) -> bool:
         if not (run / LOCK).is_file():
             return False
         with opened_lock(run / LOCK) as file:
-            return lock(file, shared=False, wait=False) == "busy"
+            return system.lock(file, shared=False, wait=False) == "busy"
     except (OSError, UserError):
         return False
 
@@ -441,12 +442,12 @@ def chosen_results(out: Path, name: str) -> list[Path]:
     """Return the results folders named ``NAME`` or ``NAME/DIGEST``. Raises UserError if there are
     none."""
     experiment, slash, digest = name.partition("/")
-    if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not DIGEST_NAME.fullmatch(digest)):
+    if not EXPERIMENT_NAME.fullmatch(experiment) or (slash and not RUN_NAME.fullmatch(digest)):
         legal = "NAME or NAME/DIGEST, as tofpod ls results shows them"
         raise UserError(f"{name!r} is not the name of any results", legal=legal)
     parent = Path(out) / experiment
     refuse_links(parent, parent / digest)
-    folders = [path for path in folders_in(parent, DIGEST_NAME) if digest in ("", path.name)]
+    folders = [path for path in folders_in(parent, RUN_NAME) if digest in ("", path.name)]
     for folder in folders or [parent / digest]:
         if not _is_declared(folder):
             raise UserError(
@@ -463,7 +464,7 @@ def oldest_results(out: Path, experiment: str, limit_bytes: int) -> list[Path]:
         folders = chosen_results(out, experiment)
     else:
         parents = folders_in(out, EXPERIMENT_NAME)
-        inside = [folder for parent in parents for folder in folders_in(parent, DIGEST_NAME)]
+        inside = [folder for parent in parents for folder in folders_in(parent, RUN_NAME)]
         folders = [folder for folder in inside if _is_declared(folder)]
     wholes = []
     for folder in folders:
@@ -504,8 +505,7 @@ def removable(folder: Path) -> list[StoredFile]:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a results folder if nothing is left in it, and the link ``latest`` if it pointed to
-    it."""
+    """Remove a results folder if nothing is left in it, and ``latest`` if it pointed to it."""
     for inner, _, _ in os.walk(folder, topdown=False):
         with contextlib.suppress(OSError):
             os.rmdir(inner)

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -24,6 +23,7 @@ from harness.programs.scorecard.bench import Bench, Effort
 from harness.programs.scorecard.quantities import QUANTITIES, Quantity, in_words, scene_of
 from harness.records.schema import Column, Table
 from harness.stills.statistics import Reading
+from harness.vocabulary import system
 from harness.vocabulary.config import Config
 from harness.vocabulary.declaration.diagnose import validated, wrong_choice
 from harness.vocabulary.declaration.shape import child
@@ -316,9 +316,7 @@ def measured(requests: Iterable[Request], effort: Effort, jobs: int) -> dict[Req
     groups = list(scenes.values())
     results: dict[Request, Reading] = {}
     last_s = time.monotonic()
-    # new processes are spawned, since a forked process would share the locks of this process's
-    # libraries
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, system.new_processes()) as pool:
         mapped = map if jobs == 1 else pool.map
         measurements = mapped(measure_group, groups, [effort] * len(groups))
         for group, readings in zip(groups, measurements, strict=True):

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import pytest
 
 from harness.runs.jobs import STATES, Ended, Job, JobEngine, Limits, attempt
 from harness.runs.processes import LocalEngine, SerialEngine
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
 from tests.support import faulty_jobs
 from tests.support.tiny_sweep import ROOT
@@ -47,7 +46,6 @@ def test_every_fault_costs_its_own_job_only():
         job(faulty_jobs.kills_its_process),
         job(faulty_jobs.aborts),
         job(faulty_jobs.hangs),
-        job(faulty_jobs.eats_memory),
     ]
     innocent = doubles(30)
     jobs = [
@@ -60,7 +58,6 @@ def test_every_fault_costs_its_own_job_only():
         "kills_its_process": "crashed",
         "aborts": "crashed",
         "hangs": "timed out",
-        "eats_memory": "failed",
     }
     assert [result[one.name].value for one in innocent] == [2 * n for n in range(30)]
     assert result["raises"].is_bug and result["raises"].why.rstrip().endswith("ValueError: a bug")
@@ -68,10 +65,17 @@ def test_every_fault_costs_its_own_job_only():
     assert not result["refuses"].is_bug and "to do: mend it" in result["refuses"].why
     assert "SIGKILL" in result["kills_its_process"].why
     assert "SIGABRT" in result["aborts"].why and "faulty_jobs.py" in result["aborts"].why
-    assert "not done after 10" in result["hangs"].why and "in hangs" in result["hangs"].why
-    assert "out of memory" in result["eats_memory"].why
+    assert "not done after 10" in result["hangs"].why
+    assert "in hangs" in result["hangs"].why or not hasattr(signal, "SIGUSR1")
     assert result["hangs"].seconds >= 10.0
     assert all(ended.state in STATES and ended.worker for ended in result.values())
+
+
+@pytest.mark.skipif(not system.limits_private_memory(), reason="only Linux limits memory")
+def test_a_job_that_needs_too_much_memory_fails():
+    result = run(LocalEngine(1, Limits(memory_mb=1000)), [job(faulty_jobs.eats_memory)])
+    ended = result["eats_memory"]
+    assert ended.state == "failed" and "out of memory" in ended.why
 
 
 def test_quick_jobs_are_ready_before_the_last_has_ended():
@@ -98,9 +102,10 @@ def test_time_and_memory_are_told():
     ended = attempt(Job("a", "trials", faulty_jobs.double, (3,)), "somebody")
     assert (ended.state, ended.value, ended.worker) == ("done", 6, "somebody")
     assert 0 <= ended.seconds < 600
-    assert 20 < ended.peak_mb < 20_000
+    assert 20 < ended.peak_mb < 20_000 or not system.peak_memory_bytes()
 
 
+@pytest.mark.skipif(not system.peak_memory_bytes(), reason="the peak is not known")
 def test_the_peak_of_memory_is_the_jobs_own():
     before = attempt(job(faulty_jobs.imported), "x").peak_mb
     import numpy as np
@@ -158,7 +163,7 @@ with processes.LocalEngine(1, Limits()) as engine:
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no driver is forked")
+@pytest.mark.skipif(not system.can_fork(), reason="no driver is forked")
 @pytest.mark.parametrize(
     ("state", "mark"),
     [("one thread", "forked"), ("another thread", "imported"), ("open3d", "imported")],
@@ -204,9 +209,7 @@ def test_a_process_killed_between_jobs_costs_nothing():
         engine.submit(Job("pid", "trials", os.getpid, ()))
         ((_, first),) = engine.ended()
         os.kill(first.value, signal.SIGKILL)
-        with contextlib.suppress(FileNotFoundError):
-            while "Z (zombie)" not in Path(f"/proc/{first.value}/status").read_text():
-                time.sleep(0.01)
+        engine._workers[0]._process.join(timeout=60.0)
         states = []
         for double in doubles(2):
             engine.submit(double)

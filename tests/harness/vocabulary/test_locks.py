@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.files import lock, one_at_a_time, opened_lock
+from harness.vocabulary.files import one_at_a_time, opened_lock
+from harness.vocabulary.system import lock
 
 HOLDS = (
     "import sys, time; from pathlib import Path; from harness.vocabulary.files import "

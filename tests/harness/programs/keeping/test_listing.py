@@ -15,6 +15,7 @@ import pytest
 
 from detectors import detector_type
 from harness.programs.keeping import clean, ls
+from harness.records.outputs import run_at
 from harness.runs.jobs import Ended
 from harness.runs.journal import Journal
 from harness.runs.results_folder import latest_run, point_to
@@ -243,11 +244,23 @@ def read_text(path: Path) -> str:
     return path.read_text()
 
 
-def test_a_link_that_cannot_be_made_is_told(tmp_path, monkeypatch, capsys):
-    def refused(*_: object) -> None:
-        raise OSError("no links here")
+def refused(*_: object) -> None:
+    raise OSError("none here")
 
+
+def test_latest_is_a_text_where_there_are_no_links(tmp_path, monkeypatch):
     monkeypatch.setattr("os.symlink", refused)
+    first = results(tmp_path, "1" * 16, trials={"done": 1})
+    second = results(tmp_path, "2" * 16, trials={"done": 1})
+    for run in (first, second):
+        point_to(run)
+        assert run_at(run.parent / "latest") == run
+    assert clean.main(["results", f"study/{second.name}", "--yes", "--results", str(tmp_path)]) == 0
+    assert not (first.parent / "latest").exists()
+
+
+def test_a_latest_that_cannot_be_made_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("os.replace", refused)
     run = results(tmp_path, "0" * 16, trials={"done": 1})
     point_to(run)
     assert f"the newest run is {run}" in capsys.readouterr().err and latest_run(run.parent) is None
