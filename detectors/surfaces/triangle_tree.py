@@ -15,6 +15,7 @@ CURVE_BITS = 20  # of a triangle's place on the curve, along one axis
 MOST_WAITING = 64  # nodes that wait while one is visited: one for each level
 # a ray that passes between two triangles by rounding meets both; a share of a triangle's side
 ON_EDGE = 1e-12
+ACROSS = 1e300
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
 
@@ -155,9 +156,10 @@ def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
 
 @numba.njit(inline="always", **PLAIN)
 def _inverse(component: float) -> float:
-    """Return the reciprocal of a ray's component; 0 for a ray across the axis."""
+    """Return the reciprocal of a ray's component; of a ray across the axis, a number that puts all
+    but the planes through its origin beyond every box."""
     if component == 0.0:
-        return 0.0
+        return ACROSS
     return 1.0 / component
 
 
@@ -167,17 +169,12 @@ def _entry(low: Vector, high: Vector, origin: Vector, reciprocal: Vector) -> flo
     entry = 0.0
     leave = np.inf
     for axis in range(3):
-        first = low[axis]
-        last = high[axis]
-        if reciprocal[axis] == 0.0:
-            if origin[axis] < first or origin[axis] > last:
-                return np.inf
-            continue
-        if reciprocal[axis] < 0.0:
-            first = high[axis]
-            last = low[axis]
-        entry = max(entry, (first - origin[axis]) * reciprocal[axis])
-        leave = min(leave, (last - origin[axis]) * reciprocal[axis])
+        to_low = (low[axis] - origin[axis]) * reciprocal[axis]
+        to_high = (high[axis] - origin[axis]) * reciprocal[axis]
+        first = to_low if reciprocal[axis] > 0.0 else to_high
+        last = to_high if reciprocal[axis] > 0.0 else to_low
+        entry = first if first > entry else entry
+        leave = last if last < leave else leave
     # a flat box is entered where it is left, but for rounding
     return entry if entry <= leave * (1.0 + 4e-16) else np.inf
 
