@@ -15,6 +15,7 @@ CURVE_BITS = 20  # of a triangle's place on the curve, along one axis
 MOST_WAITING = 64  # nodes that wait while one is visited: one for each level
 # a ray that passes between two triangles by rounding meets both; a share of a triangle's side
 ON_EDGE = 1e-12
+ACROSS = 1e300
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
 
@@ -82,6 +83,11 @@ def closest_places(tree: TriangleTree, points: np.ndarray) -> tuple[np.ndarray, 
     return _closest_places(*tree, np.ascontiguousarray(points, float))
 
 
+# Compiled code reads places as triples of numbers: a row of an array would be an object of its own,
+# which costs more than the arithmetic.
+Vector = tuple[float, float, float]
+
+
 @numba.njit(**PLAIN)
 def _first_hits(
     corners: np.ndarray,
@@ -95,26 +101,23 @@ def _first_hits(
     shares = np.zeros((len(origins), 3))
     leaves = len(lows) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
-    reciprocal = np.empty(3)
     for i in range(len(origins)):
-        origin = origins[i]
-        direction = directions[i]
-        for axis in range(3):
-            # 0 for a ray across the axis
-            reciprocal[axis] = 0.0
-            if direction[axis] != 0.0:
-                reciprocal[axis] = 1.0 / direction[axis]
+        origin = _row(origins, i)
+        direction = _row(directions, i)
+        # its comparisons would let it into every box
+        if np.isnan(_dot(origin, direction)):
+            continue
+        reciprocal = (_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2]))
         nearest = np.inf
-        # a ray that is not a number enters no box
         waiting[0] = 1
-        size = 1 if _entry(lows[1], highs[1], origin, reciprocal) < np.inf else 0
+        size = 1 if _entry(_row(lows, 1), _row(highs, 1), origin, reciprocal) < np.inf else 0
         while size > 0:
             size -= 1
             node = waiting[size]
             if node >= leaves:
                 begin = (node - leaves) * LEAF
                 for j in range(begin, min(begin + LEAF, len(corners))):
-                    distance, u, v = _met(corners[j], origin, direction)
+                    distance, u, v = _met(corners, j, origin, direction)
                     is_first = distance == nearest and numbers[j] < first[i]
                     if distance < nearest or (is_first and distance < np.inf):
                         nearest = distance
@@ -125,8 +128,8 @@ def _first_hits(
                 continue
             near_node = 2 * node
             far = near_node + 1
-            near_entry = _entry(lows[near_node], highs[near_node], origin, reciprocal)
-            far_entry = _entry(lows[far], highs[far], origin, reciprocal)
+            near_entry = _entry(_row(lows, near_node), _row(highs, near_node), origin, reciprocal)
+            far_entry = _entry(_row(lows, far), _row(highs, far), origin, reciprocal)
             if far_entry < near_entry:
                 near_node, far = far, near_node
                 near_entry, far_entry = far_entry, near_entry
@@ -140,47 +143,58 @@ def _first_hits(
 
 
 @numba.njit(inline="always", **PLAIN)
-def _entry(low: np.ndarray, high: np.ndarray, origin: np.ndarray, reciprocal: np.ndarray) -> float:
+def _row(places: np.ndarray, i: int) -> Vector:
+    """Return one of places (n, 3)."""
+    return places[i, 0], places[i, 1], places[i, 2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
+    """Return a corner of one of triangles (m, 3, 3)."""
+    return corners[j, number, 0], corners[j, number, 1], corners[j, number, 2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _inverse(component: float) -> float:
+    """Return the reciprocal of a ray's component; of a ray across the axis, a number that puts all
+    but the planes through its origin beyond every box."""
+    if component == 0.0:
+        return ACROSS
+    return 1.0 / component
+
+
+@numba.njit(inline="always", **PLAIN)
+def _entry(low: Vector, high: Vector, origin: Vector, reciprocal: Vector) -> float:
     """Return where a ray enters a box, at least 0; infinite if it does not."""
     entry = 0.0
     leave = np.inf
     for axis in range(3):
-        first = low[axis]
-        last = high[axis]
-        if reciprocal[axis] == 0.0:
-            if origin[axis] < first or origin[axis] > last:
-                return np.inf
-            continue
-        if reciprocal[axis] < 0.0:
-            first = high[axis]
-            last = low[axis]
-        entry = max(entry, (first - origin[axis]) * reciprocal[axis])
-        leave = min(leave, (last - origin[axis]) * reciprocal[axis])
+        to_low = (low[axis] - origin[axis]) * reciprocal[axis]
+        to_high = (high[axis] - origin[axis]) * reciprocal[axis]
+        first = to_low if reciprocal[axis] > 0.0 else to_high
+        last = to_high if reciprocal[axis] > 0.0 else to_low
+        entry = first if first > entry else entry
+        leave = last if last < leave else leave
     # a flat box is entered where it is left, but for rounding
     return entry if entry <= leave * (1.0 + 4e-16) else np.inf
 
 
 @numba.njit(inline="always", **PLAIN)
-def _met(
-    corners: np.ndarray, origin: np.ndarray, direction: np.ndarray
-) -> tuple[float, float, float]:
+def _met(corners: np.ndarray, j: int, origin: Vector, direction: Vector) -> Vector:
     """Return where a ray meets a triangle, in lengths of its direction, infinite if it does not,
     and the shares of the second and third corner (Moeller and Trumbore 1997)."""
-    second = corners[1] - corners[0]
-    third = corners[2] - corners[0]
-    start = origin - corners[0]
-    px = direction[1] * third[2] - direction[2] * third[1]
-    py = direction[2] * third[0] - direction[0] * third[2]
-    pz = direction[0] * third[1] - direction[1] * third[0]
-    volume = second[0] * px + second[1] * py + second[2] * pz
+    first = _corner(corners, j, 0)
+    second = _minus(_corner(corners, j, 1), first)
+    third = _minus(_corner(corners, j, 2), first)
+    start = _minus(origin, first)
+    across = _cross(direction, third)
+    volume = _dot(second, across)
     if volume == 0.0:
         return np.inf, 0.0, 0.0
-    u = (start[0] * px + start[1] * py + start[2] * pz) / volume
-    qx = start[1] * second[2] - start[2] * second[1]
-    qy = start[2] * second[0] - start[0] * second[2]
-    qz = start[0] * second[1] - start[1] * second[0]
-    v = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / volume
-    distance = (third[0] * qx + third[1] * qy + third[2] * qz) / volume
+    u = _dot(start, across) / volume
+    around = _cross(start, second)
+    v = _dot(direction, around) / volume
+    distance = _dot(third, around) / volume
     is_inside = u >= -ON_EDGE and v >= -ON_EDGE and u + v <= 1.0 + ON_EDGE
     if is_inside and distance >= 0.0:
         return distance, u, v
@@ -200,35 +214,36 @@ def _closest_places(
     leaves = len(lows) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
     for i in range(len(points)):
-        point = points[i]
+        point = _row(points, i)
         nearest = np.inf
         if i > 0:
             # the place closest to the point before it bounds the search, but may not be the first
-            nearest = (1.0 + 1e-12) * _square_off(feet[i - 1], feet[i - 1], point)
+            before = _row(feet, i - 1)
+            nearest = (1.0 + 1e-12) * _square_off(before, before, point)
         waiting[0] = 1
         size = 1
         while size > 0:
             size -= 1
             node = waiting[size]
-            if _square_off(lows[node], highs[node], point) > nearest:
+            if _square_off(_row(lows, node), _row(highs, node), point) > nearest:
                 continue
             if node >= leaves:
                 begin = (node - leaves) * LEAF
                 for j in range(begin, min(begin + LEAF, len(corners))):
-                    x, y, z = _closest(corners[j], point)
-                    square = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
+                    place = _closest(corners, j, point)
+                    square = _square_off(place, place, point)
                     is_first = square == nearest and numbers[j] < closest[i]
                     if square < nearest or is_first:
                         nearest = square
                         closest[i] = numbers[j]
-                        feet[i, 0] = x
-                        feet[i, 1] = y
-                        feet[i, 2] = z
+                        feet[i, 0] = place[0]
+                        feet[i, 1] = place[1]
+                        feet[i, 2] = place[2]
                 continue
             near_node = 2 * node
             far = near_node + 1
-            near_square = _square_off(lows[near_node], highs[near_node], point)
-            far_square = _square_off(lows[far], highs[far], point)
+            near_square = _square_off(_row(lows, near_node), _row(highs, near_node), point)
+            far_square = _square_off(_row(lows, far), _row(highs, far), point)
             if far_square < near_square:
                 near_node, far = far, near_node
             waiting[size] = far
@@ -238,7 +253,7 @@ def _closest_places(
 
 
 @numba.njit(inline="always", **PLAIN)
-def _square_off(low: np.ndarray, high: np.ndarray, point: np.ndarray) -> float:
+def _square_off(low: Vector, high: Vector, point: Vector) -> float:
     """Return the square of a point's distance from a box."""
     square = 0.0
     for axis in range(3):
@@ -248,17 +263,19 @@ def _square_off(low: np.ndarray, high: np.ndarray, point: np.ndarray) -> float:
 
 
 @numba.njit(inline="always", **PLAIN)
-def _closest(corners: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+def _closest(corners: np.ndarray, j: int, point: Vector) -> Vector:
     """Return the place on a triangle that is closest to a point (Ericson 2005, 5.1.5)."""
-    first = corners[0]
-    second_side = corners[1] - first
-    third_side = corners[2] - first
-    d1 = _dot(second_side, point - first)
-    d2 = _dot(third_side, point - first)
-    d3 = _dot(second_side, point - corners[1])
-    d4 = _dot(third_side, point - corners[1])
-    d5 = _dot(second_side, point - corners[2])
-    d6 = _dot(third_side, point - corners[2])
+    first = _corner(corners, j, 0)
+    second = _corner(corners, j, 1)
+    third = _corner(corners, j, 2)
+    second_side = _minus(second, first)
+    third_side = _minus(third, first)
+    d1 = _dot(second_side, _minus(point, first))
+    d2 = _dot(third_side, _minus(point, first))
+    d3 = _dot(second_side, _minus(point, second))
+    d4 = _dot(third_side, _minus(point, second))
+    d5 = _dot(second_side, _minus(point, third))
+    d6 = _dot(third_side, _minus(point, third))
     # twice the areas that the point makes with each side, of the sign of the triangle's own
     opposite_third = d1 * d4 - d3 * d2
     opposite_second = d5 * d2 - d1 * d6
@@ -289,6 +306,21 @@ def _closest(corners: np.ndarray, point: np.ndarray) -> tuple[float, float, floa
 
 
 @numba.njit(inline="always", **PLAIN)
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the scalar product of two vectors (3,)."""
-    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+def _minus(a: Vector, b: Vector) -> Vector:
+    """Return the difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _dot(a: Vector, b: Vector) -> float:
+    """Return the scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product of two vectors."""
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return x, y, z

@@ -75,8 +75,7 @@ def compared(
         surface = drawing_under(_drawing(board.as_drawn), cloud.points_m[mask], central)
         return replace(cloud, expected=surface)
     if isinstance(reference, GoodPartsReference):
-        stack = _stack(boards.good_parts, recorded).first_parts(reference.parts)
-        scan = stack.mean(many(reference.parts, "good part"))
+        scan = _mean(boards.good_parts, recorded, reference.parts)
     else:
         (earlier,) = boards.earlier
         scan = _scan(earlier, recorded, ("earlier", *labels))
@@ -99,10 +98,18 @@ def _scan(ref: BoardRef, recorded: Recorded, labels: Sequence[str | int]) -> Par
     return scan_of(cloud, crop(cloud, recorded.crop), "the earlier capture")
 
 
-# all trials of a unit share its good parts, of which each takes a second or two to be placed
-@lru_cache(maxsize=2)
+# all trials of a unit share its good parts, of which each takes a second or two to be placed;
+# trials of a few kinds of boards take turns
+@lru_cache(maxsize=4)
 def _stack(parts: tuple[BoardRef, ...], recorded: Recorded) -> GoodParts:
     """Record good parts, and lay them on the first."""
     scans = [_scan(part, recorded, ("good part", number)) for number, part in enumerate(parts)]
     first, *others = scans
     return good_parts(first, [(other, None) for other in others], central=True)
+
+
+@lru_cache(maxsize=12)
+def _mean(parts: tuple[BoardRef, ...], recorded: Recorded, count: int) -> PartScan:
+    """Return the mean of the first ``count`` good parts."""
+    stack = _stack(parts, recorded).first_parts(count)
+    return stack.mean(many(count, "good part"))

@@ -10,6 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from harness.vocabulary.text import many
+
 UNITS = {
     "_mrad": "mrad",
     "_deg": "°",
@@ -17,6 +19,7 @@ UNITS = {
     "_nm": "nm",
     "_px": "px",
     "_hz": "Hz",
+    "_percent": "%",
     "_m": "m",
 }
 """Endings of keys that name a unit; longer endings come first."""
@@ -25,7 +28,12 @@ CHOICES = (
     "kind",
     "method",
 )  # keys that select one of several kinds of what the key before them names
-NAMED = ("camera", "detector", "damage")  # axes whose values explain themselves
+# axes whose values explain themselves
+NAMED = ("camera", "detector", "damage", "shape", "compared with")
+SHAPES = {"flat": "flat board", "panel": "door panel", "casting": "ribbed casting"}
+"""Kinds of a target's shape, in words; others are words."""
+ABSENT = "none"
+"""Text of a value that is null."""
 UNKNOWNS = "unknowns"
 """Key of an experiment's unknowns, and axis of such a study: whether its boards have the stated
 values or drawn ones."""
@@ -50,14 +58,24 @@ def unit_of(path: str) -> str:
 def value_text(path: str, value: Any) -> str:
     """Return a value with its unit on one short line; a mapping as its kind, then its keys and
     values."""
+    name = _split(path)[0]
+    if name == "compared with":
+        return _reference_text(value)
+    if value is None:
+        return ABSENT
     if isinstance(value, dict) and value:
         choice = next((key for key in CHOICES if key in value), "")
-        settings = (
-            f"{_split(key)[0]} {value_text(key, setting)}"
-            for key, setting in value.items()
-            if key != choice
-        )
-        return on_one_line(", ".join(([str(value[choice])] if choice else []) + list(settings)))
+        parts = []
+        if choice:
+            kind = str(value[choice])
+            parts.append(SHAPES.get(kind, kind) if name == "shape" else kind)
+        for key, setting in value.items():
+            text = value_text(key, setting)
+            if key == "shape":
+                parts.append(text)
+            elif key != choice:
+                parts.append(f"{_split(key)[0]} {text}")
+        return on_one_line(", ".join(parts))
     unit = unit_of(path)
     if unit and isinstance(value, list | tuple) and len(value) == 2 and all(map(_is_number, value)):
         low, high = value
@@ -66,6 +84,16 @@ def value_text(path: str, value: Any) -> str:
         Path(value).stem if path.endswith("camera.name") and str(value).endswith(".yaml") else value
     )
     return f"{value:g} {unit}" if _is_number(value) and unit else text
+
+
+def _reference_text(value: Any) -> str:
+    """Return what boards are compared with, in words."""
+    if value is None:
+        return "no reference"
+    if "parts" in value:
+        return many(value["parts"], "good part")
+    kinds = {"scan": "an earlier scan", "mesh": "the drawing"}
+    return kinds[value["kind"]]
 
 
 @cache
@@ -85,8 +113,8 @@ def camera_title(name: str) -> str:
 
 
 def in_words(variant: str) -> str:
-    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m`` becomes "Kinect v2,
-    distance 0.5 m"."""
+    """Return a set-up's name in words: ``camera=kinect_v2, distance=0.5 m, filter=none`` becomes
+    "Kinect v2, distance 0.5 m, no filter"."""
     return ", ".join(_setting_in_words(part) for part in re.split(r", (?=[^=,]+=)", variant))
 
 
@@ -96,11 +124,18 @@ def _setting_in_words(part: str) -> str:
         return part
     if re.fullmatch(r"\w+(\.\w+)+", name):
         with contextlib.suppress(ValueError):
-            text = {"true": "on", "false": "off", "null": "none"}.get(text) or value_text(
-                name, json.loads(text)
-            )
+            text = value_text(name, json.loads(text))
         name = _split(name)[0]
-    return camera_title(text) if name in NAMED else f"{name} {text}".strip()
+    if name in NAMED:
+        return camera_title(text)
+    if text == ABSENT:
+        return f"no {name}"
+    if re.fullmatch(r"\w+", text):
+        text = {"true": "on", "false": "off"}.get(text, text.replace("_", " "))
+    albedo = re.fullmatch(r"(.*albedo) (\d+)", name)
+    if albedo:
+        return f"{albedo[1]} {text} at {albedo[2]} nm"
+    return f"{name} {text}".strip()
 
 
 def differing(value: Any, siblings: Iterable[Any]) -> Any:

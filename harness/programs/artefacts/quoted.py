@@ -53,15 +53,19 @@ class _Formats(Formatter):
         return super().format_field(value, format_spec)
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        """Return a camera's title for ``!t``, the kind of a damage for ``!k``, and settings, which
-        may be absent, in words for ``!w``."""
+        """Return a camera's title for ``!t``, the kind of a damage for ``!k``, the drawing's shape
+        of a target for ``!s``, and a reference, which may be absent, in words for ``!r``."""
         if conversion == "t":
             return _title(value)
         if conversion == "k":
             return json.loads(value)["kind"]
-        if conversion == "w":
-            settings = json.loads(value) if isinstance(value, str) and value else None
-            return "none" if settings is None else value_text("", settings)
+        if conversion == "s":
+            shape = json.loads(value)
+            drawn = shape.get("shape", shape)
+            return value_text("shape", {"kind": drawn["kind"]})
+        if conversion == "r":
+            reference = json.loads(value) if isinstance(value, str) and value else None
+            return value_text("compared_with", reference)
         return super().convert_field(value, conversion)
 
 

@@ -162,7 +162,7 @@ def test_names_of_paths_and_values():
         "",
     ]
     assert value_text("x.distance_m", 0.75) == "0.75 m"
-    assert value_text("x.distance_m", None) == "null"
+    assert value_text("x.distance_m", None) == "none"
     assert value_text("x.edge_gate", True) == "true"
     assert len(value_text("x", "y" * 100)) == 60
 
@@ -173,6 +173,21 @@ def test_set_ups_and_variations_read_as_words():
     )
     assert in_words("source.target.distance_m=0.5") == "distance 0.5 m"
     assert in_words("source.camera.edge_gate=false") == "edge gate off"
+    assert in_words("filter=none, filter=hole_filling") == "no filter, filter hole filling"
+    assert in_words("albedo 850=0.1") == "albedo 0.1 at 850 nm"
+
+
+def test_references_and_shapes_read_as_an_engineer_says_them():
+    good_parts = [{"kind": "good_parts", "parts": 1}, {"parts": 20}]
+    references = [None, {"kind": "scan"}, *good_parts, {"kind": "mesh"}]
+    texts = [value_text("compared_with", value) for value in references]
+    assert texts[:2] == ["no reference", "an earlier scan"]
+    assert texts[2:] == ["1 good part", "20 good parts", "the drawing"]
+    made = {"kind": "made", "shape": {"kind": "panel"}, "form_mm": 0.3, "sizes_percent": 2.0}
+    shape = value_text("source.target.board.shape", made)
+    assert shape == "made, door panel, form 0.3 mm, sizes 2 %"
+    name = "shape=flat board, compared with=5 good parts"
+    assert in_words(name) == "flat board, 5 good parts"
     assert in_words("the script as it stands, k = 1.2") == "the script as it stands, k = 1.2"
 
 

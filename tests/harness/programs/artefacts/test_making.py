@@ -23,7 +23,7 @@ artefacts:
     commands: ['python make.py']
     rows: [results/made/latest/limits.csv]
     table:
-      labels: {camera: "{camera!t}", damage: "{damage!k}", beside: "{beside!w}", after: "{after!w}"}
+      labels: {camera: "{camera!t}", damage: "{damage!k}", beside: "{beside!r}", after: "{after!s}"}
       across: {column: frames, head: "frames: {:g}"}
       cells: {a90: "{a90_mm:.1f} mm"}
       absent: none
@@ -46,9 +46,10 @@ from pathlib import Path
 out = Path("results/made/latest")
 out.mkdir(parents=True, exist_ok=True)
 rows = ["camera,frames,a90_mm,damage,beside,after"]
-beside = '"{""kind"": ""good"", ""parts"": 5}"'
+beside = '"{""kind"": ""good_parts"", ""parts"": 5}"'
+after = '"{""kind"": ""made"", ""shape"": {""kind"": ""flat"", ""side_mm"": 2}}"'
 for frames, a90_mm in ((1, "4.04"), (50, "")):
-    rows.append(f'kinect_v2,{frames},{a90_mm},"{{""kind"": ""blind""}}",{beside},')
+    rows.append(f'kinect_v2,{frames},{a90_mm},"{{""kind"": ""blind""}}",{beside},{after}')
 (out / "limits.csv").write_text("\\n".join(rows) + "\\n")
 with Path("count").open("a") as count:
     count.write("1")
@@ -65,7 +66,7 @@ The end.
 """
 TABLE = """| camera | damage | beside | after | a90, frames: 1 | a90, frames: 50 |
 |---|---|---|---|---|---|
-| Kinect v2 | blind | good, parts 5 | none | 4.0 mm | none |"""
+| Kinect v2 | blind | 5 good parts | flat board | 4.0 mm | none |"""
 CACHED = (
     declaration.declared_artefacts,
     declaration._command_digests,
