@@ -1,10 +1,12 @@
 """What one recording of a printed gauge says of simulated cameras that are wrong in a known way.
 
-    python tests/validation/gauge_recovery.py [--draws N]
+    python tests/validation/gauge_recovery.py --out gauge_recovery.csv [--units N]
 
-Prints a table: the true error, its mean estimate, the mean half width of the 95 % interval, and how
-many of the intervals hold the truth. Each camera takes 12 frames of 240 x 224 pixels at 0.47 m with
-1 mm of noise; each draw is another unit with another fixed pattern and other noise."""
+Writes one row per camera, unit and quantity: truth, estimate, 95 % interval; prints a table of the
+mean estimate, the mean half width, and how many intervals hold the truth. The same command goes on
+with the cameras that the file does not hold yet. Each unit has another fixed pattern (0.3 mm), other
+noise (1 mm), another pose, and takes 12 frames of 240 x 224 pixels at 0.42 to 0.55 m; light is mixed
+over the area of each pixel."""
 
 import argparse
 import sys
@@ -13,68 +15,125 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.evaluation.intervals import Interval
 from harness.programs.camera import characterise
 from harness.programs.camera.gauge_report import GaugeReading, read_recording
-from harness.vocabulary.geometry import MM
-from tests.support.gauge_scene import recorded
+from harness.vocabulary.geometry import MM, rotation_xyz_deg
+from harness.vocabulary.seeds import random_stream
+from tests.support.gauge_scene import CAMERA_NAME, recorded
 
 CAMERAS = {
-    "right": {"pattern_mm": 0.3, "blur_px": 0.3},
-    "scale 1 %": {"scale": 1.01, "pattern_mm": 0.3, "blur_px": 0.3},
-    "bias 5 mm": {"bias_mm": 5.0, "pattern_mm": 0.3, "blur_px": 0.3},
-    "blur 0.6 px": {"pattern_mm": 0.3, "blur_px": 0.6},
-    "all three, half of the pixels lost": {
+    "right": {"blur_px": 0.3},
+    "scale 1 %": {"scale": 1.01, "blur_px": 0.3},
+    "bias 5 mm": {"bias_mm": 5.0, "blur_px": 0.3},
+    "blur 0.6 px": {"blur_px": 0.6},
+    "offset of the unit": {"offset_mm": 3.0, "blur_px": 0.3},
+    "all, half of the pixels lost": {
         "scale": 1.01,
         "bias_mm": 5.0,
-        "pattern_mm": 0.3,
         "blur_px": 0.6,
         "dropped": 0.5,
     },
 }
+FIRST_SEED = 400
+
+
+def pose_of(seed: int) -> np.ndarray:
+    """``T_camera_gauge`` of a unit: 15 to 30 degrees and less about all axes."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    tilt_deg = rng.uniform(15, 30)
+    T[:3, :3] = rotation_xyz_deg(180 - tilt_deg, rng.uniform(-15, 15), rng.uniform(-20, 20))
+    T[:3, 3] = [*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.42, 0.55)]
+    return T
 
 
 def quantities(
-    reading: GaugeReading, wrong: dict[str, float]
-) -> Iterator[tuple[str, float, float, Interval]]:
-    """Yield the name, the truth, the estimate and its interval of each error."""
+    reading: GaugeReading, wrong: dict[str, float], seed: int
+) -> Iterator[dict[str, float | str]]:
+    """Yield each quantity of a unit with its truth, estimate and interval."""
     scale = reading.fit.interval(0)
-    percent = Interval(100 * (scale.low - 1), 100 * (scale.high - 1))
-    true_percent = 100 * (wrong.get("scale", 1.0) - 1)
-    yield "scale (%)", true_percent, 100 * (reading.fit.scale - 1), percent
+    yield {
+        "quantity": "scale (%)",
+        "truth": 100 * (wrong.get("scale", 1.0) - 1),
+        "estimate": 100 * (reading.fit.scale - 1),
+        "low": 100 * (scale.low - 1),
+        "high": 100 * (scale.high - 1),
+    }
+    offset_mm = 0.0
+    if "offset_mm" in wrong:
+        deviation = random_stream(seed, "unit offset", CAMERA_NAME).standard_normal()
+        offset_mm = wrong["offset_mm"] * float(deviation)
     bias = reading.fit.interval(1)
-    in_mm = Interval(bias.low / MM, bias.high / MM)
-    yield "bias (mm)", wrong.get("bias_mm", 0.0), reading.fit.bias_m / MM, in_mm
+    yield {
+        "quantity": "bias (mm)",
+        "truth": wrong.get("bias_mm", 0.0) + offset_mm,
+        "estimate": reading.fit.bias_m / MM,
+        "low": bias.low / MM,
+        "high": bias.high / MM,
+    }
     assert reading.blur is not None
-    yield "blur (px)", wrong["blur_px"], reading.blur.blur_px, reading.blur.interval
+    yield {
+        "quantity": "blur (px)",
+        "truth": wrong["blur_px"],
+        "estimate": reading.blur.blur_px,
+        "low": reading.blur.interval.low,
+        "high": reading.blur.interval.high,
+    }
+
+
+def rows_of(camera: str, units: int) -> list[dict[str, float | str]]:
+    """Return the rows of a camera."""
+    wrong = CAMERAS[camera]
+    rows = []
+    for unit in range(units):
+        seed = FIRST_SEED + 100 * list(CAMERAS).index(camera) + unit
+        with tempfile.TemporaryDirectory() as folder:
+            arguments = recorded(
+                Path(folder), pattern_mm=0.3, seed=seed, T_camera_gauge=pose_of(seed), **wrong
+            )
+            reading = read_recording(characterise.main.parser().parse_args(arguments))
+        for quantity in quantities(reading, wrong, seed):
+            rows.append({"camera": camera, "unit": unit, **quantity})
+    return rows
+
+
+def table_of(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table: mean truth -> mean estimate ± mean half width (intervals that
+    hold the truth, of all)."""
+    names = list(dict.fromkeys(rows.quantity))
+    yield f"| camera | {' | '.join(names)} |"
+    yield "|---" * (len(names) + 1) + "|"
+    for camera, of_camera in rows.groupby("camera", sort=False):
+        cells = []
+        for name in names:
+            units = of_camera[of_camera.quantity == name]
+            half = (units.high - units.low).mean() / 2
+            held = ((units.low <= units.truth) & (units.truth <= units.high)).sum()
+            text = f"{units.truth.mean():.2f}: {units.estimate.mean():.2f} ± {half:.2f}"
+            cells.append(f"{text} ({held}/{len(units)})")
+        yield f"| {camera} | {' | '.join(cells)} |"
 
 
 def main() -> None:
-    """Print the table."""
+    """Write the rows and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=3)
-    draws = parser.parse_args().draws
-    print("| camera | quantity | true | found | ± | held |")
-    print("|---|---|---|---|---|---|")
-    for name, wrong in CAMERAS.items():
-        rows: dict[str, list[tuple[float, float, Interval]]] = {}
-        for draw in range(draws):
-            with tempfile.TemporaryDirectory() as folder:
-                arguments = recorded(Path(folder), seed=100 + draw, **wrong)
-                reading = read_recording(characterise.main.parser().parse_args(arguments))
-            for quantity, truth, estimate, interval in quantities(reading, wrong):
-                rows.setdefault(quantity, []).append((truth, estimate, interval))
-        for quantity, results in rows.items():
-            truth = results[0][0]
-            mean = float(np.mean([estimate for _, estimate, _ in results]))
-            half = float(np.mean([(ends.high - ends.low) / 2 for _, _, ends in results]))
-            covered = sum(ends.low <= truth <= ends.high for _, _, ends in results)
-            cells = (f"{truth:.2f}", f"{mean:.2f}", f"{half:.2f}", f"{covered} of {draws}")
-            print(f"| {name} | {quantity} | {' | '.join(cells)} |", flush=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--units", type=int, default=4)
+    options = parser.parse_args()
+    rows = pd.DataFrame()
+    if options.out.exists():
+        rows = pd.read_csv(options.out)
+    for camera in CAMERAS:
+        if len(rows) and camera in set(rows.camera):
+            continue
+        rows = pd.concat([rows, pd.DataFrame(rows_of(camera, options.units))])
+        rows.to_csv(options.out, index=False)
+    print("\n".join(table_of(rows)))
 
 
 if __name__ == "__main__":

@@ -49,12 +49,15 @@ def _by_marks(cloud: Cloud, gauge: SolidGauge) -> tuple[np.ndarray, str] | None:
     marks_read = find_marks(cloud, cloud.valid, CodedMarks(dictionary=gauge.dictionary))
     by_code = {mark.code: mark.centre_m for mark in marks_read.trusted}
     marks = [mark for mark in gauge.marks if mark.code in by_code]
-    if len(marks) < FEWEST_MARKS:
-        return None
-    on_gauge_m = np.array([(mark.x_mm, mark.y_mm, 0.0) for mark in marks]) * MM
-    in_camera_m = np.array([by_code[mark.code] for mark in marks])
-    T_camera_gauge = kabsch(on_gauge_m, in_camera_m, np.ones(len(marks)))
-    return T_camera_gauge, f"the gauge is placed by {len(marks)} of its marks"
+    # a code of something else in view is left out with the marks that then fit one another
+    for count in range(len(marks), FEWEST_MARKS - 1, -1):
+        for chosen in combinations(marks, count):
+            on_gauge_m = np.array([(mark.x_mm, mark.y_mm, 0.0) for mark in chosen]) * MM
+            in_camera_m = np.array([by_code[mark.code] for mark in chosen])
+            T_camera_gauge = _paired(on_gauge_m, in_camera_m)
+            if T_camera_gauge is not None:
+                return T_camera_gauge, f"the gauge is placed by {count} of its marks"
+    return None
 
 
 def _by_arrangement(gauge_m: np.ndarray, found_m: np.ndarray) -> tuple[np.ndarray | None, int]:
@@ -81,11 +84,12 @@ def _by_arrangement(gauge_m: np.ndarray, found_m: np.ndarray) -> tuple[np.ndarra
 
 
 def _paired(from_m: np.ndarray, to_m: np.ndarray) -> np.ndarray | None:
-    """Return the rigid motion of three points onto three; None if their distances differ."""
+    """Return the rigid motion of three points or more (n, 3) onto as many; None if their distances
+    differ."""
     from_sides_m = np.linalg.norm(from_m - np.roll(from_m, 1, axis=0), axis=1)
     to_sides_m = np.linalg.norm(to_m - np.roll(to_m, 1, axis=0), axis=1)
     if (np.abs(from_sides_m - to_sides_m) > OFF_M + OFF_SHARE * from_sides_m).any():
         return None
-    T = kabsch(from_m, to_m, np.ones(3))
+    T = kabsch(from_m, to_m, np.ones(len(from_m)))
     apart_m = np.linalg.norm(transform_points(T, from_m) - to_m, axis=1)
     return T if (apart_m < 2 * OFF_M).all() else None

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from detectors.rigid_motion import displacement_jacobian, moved_by
 from detectors.surfaces.expected import Triangles, normals_of
@@ -48,8 +48,13 @@ LEAST_STEP_M = 2 * MM
 LARGEST_STEP_M = 25 * MM
 EDGE_REACH_PX = 3
 FEWEST_EDGE_PX = 100
-WIDEST_BLUR_PX = 3.0
 BLOCKS = 12
+_BLURS_PX = (0.0, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
+# rays of a pixel at an edge, a Fibonacci lattice: of a square grid with 4 x 4 rays, an edge along
+# one side takes or leaves whole rows, and looks blurred by 0.1 pixels
+SUBRAYS = 34
+GENERATOR = 21
+LEAST_BEND_M = 0.2 * MM  # second difference of range from which one ray is not a pixel's mean
 
 
 class FlatLevel(NamedTuple):
@@ -98,20 +103,23 @@ class RangeFit:
 def range_and_blur(
     image: RangeImage, gauge: SolidGauge, T_camera_gauge: np.ndarray
 ) -> tuple[RangeFit, Blur | None, np.ndarray]:
-    """Return scale and bias from a pose that is right to a few millimetres, blur, and the sharp
-    ranges (h, w) of the gauge. What blur does to curved surfaces and near edges is taken out of
+    """Return scale and bias from a pose that is right to a few millimetres, blur, and the ranges
+    (h, w) of the gauge without it. What blur does to curved surfaces and near edges is taken out of
     the image before the last fit. Raises UserError if too few elements have enough pixels."""
     triangles = triangles_of(gauge)
     fit = _fitted(image, gauge, _start(T_camera_gauge))
     sharp_m = seen_ranges_m(triangles, image.rays, fit.T_camera_gauge)
+    seen_m = averaged_ranges_m(triangles, image.rays, fit.T_camera_gauge, sharp_m)
     straight = replace(image, range_m=(image.range_m - fit.bias_m) / fit.scale)
-    blur = edge_blur(straight, sharp_m)
+    away_m = float(np.linalg.norm(fit.T_camera_gauge[:3, 3]))
+    blur = edge_blur(straight, seen_m, gauge.uncertainty.place_mm * MM / away_m / image.pitch_rad)
     if blur is None:
-        return fit, None, sharp_m
-    displaced_m = blurred(sharp_m, blur.blur_px) - sharp_m
+        return fit, None, seen_m
+    displaced_m = blurred(seen_m, blur.blur_px) - sharp_m
     deblurred = replace(image, range_m=image.range_m - fit.scale * displaced_m)
     fit = _fitted(deblurred, gauge, fit)
-    return fit, blur, seen_ranges_m(triangles, image.rays, fit.T_camera_gauge)
+    sharp_m = seen_ranges_m(triangles, image.rays, fit.T_camera_gauge)
+    return fit, blur, averaged_ranges_m(triangles, image.rays, fit.T_camera_gauge, sharp_m)
 
 
 def _start(T_camera_gauge: np.ndarray) -> RangeFit:
@@ -349,6 +357,29 @@ def seen_ranges_m(triangles: Triangles, rays: np.ndarray, T_camera_gauge: np.nda
     return np.where(is_ray, range_m.reshape(is_ray.shape), np.nan)
 
 
+def averaged_ranges_m(
+    triangles: Triangles, rays: np.ndarray, T_camera_gauge: np.ndarray, sharp_m: np.ndarray
+) -> np.ndarray:
+    """Return the mean range (h, w) over each pixel's area, as the light of its parts mixes where
+    they are near each other; ``sharp_m`` (h, w) is that of its middle. NaN at the outline."""
+    bend_m = np.abs(cv2.Laplacian(np.nan_to_num(sharp_m), cv2.CV_64F))
+    bent = ndimage.maximum_filter(bend_m, size=3) > LEAST_BEND_M
+    bent &= np.isfinite(sharp_m)
+    by_row = np.gradient(rays, axis=0)[bent]
+    by_column = np.gradient(rays, axis=1)[bent]
+    number = np.arange(SUBRAYS)
+    across = (number + 0.5) / SUBRAYS - 0.5
+    down = (number * GENERATOR % SUBRAYS + 0.5) / SUBRAYS - 0.5
+    parts = []
+    for share_x, share_y in zip(across, down, strict=True):
+        part = rays[bent] + share_y * by_row + share_x * by_column
+        parts.append(part / np.linalg.norm(part, axis=-1, keepdims=True))
+    parts_m = seen_ranges_m(triangles, np.stack(parts), T_camera_gauge)
+    averaged_m = sharp_m.copy()
+    averaged_m[bent] = parts_m.mean(axis=0)
+    return averaged_m
+
+
 def blurred(range_m: np.ndarray, blur_px: float) -> np.ndarray:
     """Return a range image (h, w) after the smoothing of an empirical camera's edges: a Gaussian
     over the inverse, with which planes stay planes."""
@@ -364,11 +395,11 @@ def blurred(range_m: np.ndarray, blur_px: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Blur:
-    """Blur of depth at the edges of steps, grooves and pockets."""
+    """Blur of depth at the edges of steps, grooves and pockets, beside that of a pixel's area."""
 
     blur_px: float
-    """Standard deviation of the Gaussian that makes the gauge's edges look like the captured
-    ones."""
+    """Standard deviation of the Gaussian, sampled at pixels, that makes the gauge's edges look like
+    the captured ones."""
     interval: Interval
     """Two-sided 95 % interval."""
     pixels: int
@@ -377,15 +408,20 @@ class Blur:
     """Share of them with a range, over that of the pixels beside."""
 
 
-def edge_blur(image: RangeImage, sharp_m: np.ndarray) -> Blur | None:
-    """Return the blur of a corrected image, by the sharp view of the gauge ``sharp_m`` (h, w);
-    None if too few pixels lie at edges. The interval is a jackknife over blocks of the image."""
+def edge_blur(image: RangeImage, seen_m: np.ndarray, displaced_px: float) -> Blur | None:
+    """Return the blur of a corrected image, by the view of the gauge without blur ``seen_m``
+    (h, w); None if too few pixels lie at edges.
+
+    A view changes in proportion to the variance of the Gaussian's samples, of which there is
+    hardly any up to 0.25 pixels, so the variance is fitted. Its error is a jackknife over blocks of
+    the image, which holds noise, fixed pattern and pose. Edges that are ``displaced_px`` from their
+    places (standard uncertainty of the gauge) look blurred by as much, which is added."""
     window = np.ones((2 * EDGE_REACH_PX + 1,) * 2)
-    low_m = ndimage.minimum_filter(np.nan_to_num(sharp_m, nan=-1.0), footprint=window)
-    high_m = ndimage.maximum_filter(np.nan_to_num(sharp_m, nan=1e3), footprint=window)
+    low_m = ndimage.minimum_filter(np.nan_to_num(seen_m, nan=-1.0), footprint=window)
+    high_m = ndimage.maximum_filter(np.nan_to_num(seen_m, nan=1e3), footprint=window)
     at_edge = (high_m - low_m > LEAST_STEP_M) & (high_m - low_m < LARGEST_STEP_M)
     # spheres are curved, and no edges
-    laplacian_m = np.abs(cv2.Laplacian(np.nan_to_num(sharp_m), cv2.CV_64F))
+    laplacian_m = np.abs(cv2.Laplacian(np.nan_to_num(seen_m), cv2.CV_64F))
     jumps = ndimage.maximum_filter(laplacian_m, footprint=window) > LEAST_STEP_M
     at_edge &= jumps
     usable = at_edge & np.isfinite(image.range_m)
@@ -396,37 +432,64 @@ def edge_blur(image: RangeImage, sharp_m: np.ndarray) -> Blur | None:
     fill_beside = np.isfinite(image.range_m[beside]).mean() if beside.any() else np.nan
     columns = np.nonzero(usable)[1]
     block = np.argsort(np.argsort(columns, kind="stable")) * BLOCKS // len(columns)
-    views = [blurred(sharp_m, blur_px)[usable] for blur_px in _BLURS_PX]
     measured_m = image.range_m[usable]
-    value_px = _best_blur(views, measured_m, np.ones(len(block), bool))
-    without = [_best_blur(views, measured_m, block != k) for k in range(BLOCKS)]
-    error_px = float(np.sqrt((BLOCKS - 1) * np.var(without)))
-    half_px = student(BLOCKS - 1) * error_px
+    views_m = [blurred(seen_m, blur_px)[usable] for blur_px in _BLURS_PX]
+    variance_px2 = variance_of(_nearest_blur(views_m, measured_m))
+    for _ in range(PASSES):
+        step_px2 = 0.02 + 0.05 * variance_px2
+        low_px2 = max(variance_px2 - step_px2, 0.0)
+        sharper_m = blurred(seen_m, blur_of(low_px2))[usable]
+        softer_m = blurred(seen_m, blur_of(low_px2 + 2 * step_px2))[usable]
+        slope = (softer_m - sharper_m) / (2 * step_px2)
+        # noise may ask for edges sharper than sharp ones, a variance below 0
+        off_m = measured_m - sharper_m - (variance_px2 - low_px2) * slope
+        change_px2, error_px2 = _jackknifed(slope, off_m, block)
+        variance_px2 += change_px2
+    half_px2 = student(BLOCKS - 1) * float(np.hypot(error_px2, displaced_px**2))
+    interval = Interval(blur_of(variance_px2 - half_px2), blur_of(variance_px2 + half_px2))
     return Blur(
-        blur_px=value_px,
-        interval=Interval(max(value_px - half_px, 0.0), value_px + half_px),
+        blur_px=blur_of(variance_px2),
+        interval=interval,
         pixels=int(usable.sum()),
         fill=float(fill / fill_beside),
     )
 
 
-_BLURS_PX = np.arange(0, WIDEST_BLUR_PX + 0.01, 0.05)
+def _nearest_blur(views_m: list[np.ndarray], measured_m: np.ndarray) -> float:
+    """Return that of `_BLURS_PX` whose view (n,) lies closest to the measured ranges (n,)."""
+    losses_m = [float(np.abs(measured_m - view_m).mean()) for view_m in views_m]
+    return float(_BLURS_PX[int(np.argmin(losses_m))])
 
-SHARPISH = 10  # of them, half a pixel: the scale of residuals is taken there
+
+def _jackknifed(slope: np.ndarray, off_m: np.ndarray, block: np.ndarray) -> tuple[float, float]:
+    """Return the change x that minimises the squares of off - slope x - constant over pixels (n,),
+    without outliers, and its standard error by leaving out one block at a time."""
+    centred_m = off_m - np.median(off_m)
+    kept = np.abs(centred_m) <= OUTLIER * 1.4826 * np.median(np.abs(centred_m)) + 1e-6
+    design = np.column_stack([slope, np.ones(len(slope))])[kept]
+    products = np.zeros((BLOCKS, 2, 2))
+    targets = np.zeros((BLOCKS, 2))
+    np.add.at(products, block[kept], design[:, :, None] * design[:, None, :])
+    np.add.at(targets, block[kept], design * off_m[kept, None])
+    product = products.sum(axis=0)
+    target = targets.sum(axis=0)
+    change = np.linalg.solve(product, target)[0]
+    without = np.linalg.solve(product - products, (target - targets)[..., None])[:, 0, 0]
+    return float(change), float(np.sqrt((BLOCKS - 1) * np.var(without)))
 
 
-def _best_blur(views: list[np.ndarray], measured_m: np.ndarray, used: np.ndarray) -> float:
-    """Return the blur whose view (n,) lies closest to the measured ranges (n,), between those of
-    `_BLURS_PX`, by robust squares."""
-    limit_m = 3 * float(np.median(np.abs(measured_m[used] - views[SHARPISH][used]))) + 1e-6
-    losses = []
-    for view in views:
-        off_m = measured_m[used] - view[used]
-        off_m = off_m - np.median(off_m)
-        losses.append(float(np.minimum(off_m**2, limit_m**2).sum()))
-    best = int(np.argmin(losses))
-    if best in (0, len(losses) - 1):
-        return float(_BLURS_PX[best])
-    below, at, above = losses[best - 1 : best + 2]
-    shift = (below - above) / (2 * (below - 2 * at + above))
-    return float(_BLURS_PX[best] + shift * (_BLURS_PX[1] - _BLURS_PX[0]))
+def variance_of(blur_px: float) -> float:
+    """Return the variance of the samples of a Gaussian, as filters use it."""
+    reach_px = int(4 * blur_px + 0.5)
+    impulse = np.zeros(2 * reach_px + 1)
+    impulse[reach_px] = 1.0
+    weights = ndimage.gaussian_filter1d(impulse, blur_px) if blur_px > 0 else impulse
+    return float((weights * np.arange(-reach_px, reach_px + 1) ** 2).sum())
+
+
+def blur_of(variance_px2: float) -> float:
+    """Return the deviation of the Gaussian whose samples have this variance; 0 for none."""
+    if variance_px2 <= 0:
+        return 0.0
+    widest_px = np.sqrt(variance_px2) + 0.5
+    return float(optimize.brentq(lambda blur_px: variance_of(blur_px) - variance_px2, 0, widest_px))

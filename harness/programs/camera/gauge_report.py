@@ -128,7 +128,7 @@ class GaugeReading:
             ends = self.blur.interval
             text += (
                 f" Edges are blurred by {self.blur.blur_px:.2f} px ({ends.low:.2f} to "
-                f"{ends.high:.2f} px by noise alone; a few hundredths more by the fit of edges)."
+                f"{ends.high:.2f} px), beside the area of a pixel."
             )
         return text
 
@@ -238,7 +238,7 @@ def _of_edges(blur: Blur | None) -> Iterator[GaugeFigure]:
         return
     ends = blur.interval
     value = Estimate(blur.blur_px, ends.low, ends.high)
-    meaning = "deviation of the Gaussian that gives edges as captured; interval of noise alone"
+    meaning = "deviation of the Gaussian that gives edges as captured, beside the area of a pixel"
     yield GaugeFigure("blur at edges", "steps, grooves, pockets", "px", value, meaning)
     wide = Estimate(WIDTH_10_90 * blur.blur_px, WIDTH_10_90 * ends.low, WIDTH_10_90 * ends.high)
     meaning = "edge response from 10 to 90 % of a step"
