@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 24
 """Most set-ups that are drawn; a table holds all."""
-WIDTH_IN = 5.4
+WIDTH_IN = 4.6
+"""Its text is then as large as the page's on a screen of 400 pixels."""
 ROW_IN = 0.36
 """Height of a set-up: its name, and below it its sizes."""
 AXIS_IN = 0.75

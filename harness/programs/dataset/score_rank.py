@@ -148,12 +148,19 @@ def answer(rows: Sequence[Ranked]) -> str:
     """State the best method of each category in a sentence."""
     from harness.tables.limits import a90_of
 
+    several = len({row.limit.record.variant for row in rows}) > 1
     sentences = []
     for row in rows:
-        if row.rank == 1:
-            record = row.limit.record
-            limit = a90_of(row.limit).text()
-            sentences.append(f"{record.variant}: {record.detector}, a90 {limit} mm.")
+        if row.rank > 1:
+            continue
+        record = row.limit.record
+        place = f"{record.variant}: " if several else ""
+        if np.isinf(_known_a90_mm(row)):
+            sentences.append(f"{place}no method has a limit within the sizes inspected.")
+            continue
+        size = a90_of(row.limit).text()
+        found = f"{record.detector} finds damage of {size} mm nine times out of ten"
+        sentences.append(f"{place}{found}.")
     return " ".join(sentences)
 
 
@@ -164,9 +171,12 @@ def leaderboard_html(rows: Sequence[Ranked], command: str) -> str:
     from harness.vocabulary.text import many
 
     caption = "a90 with its 95 % interval over boards, and a90/95 (bar), by method."
-    limits = [
-        replace(row.limit, record=replace(row.limit.record, variant=_label(row))) for row in rows
-    ]
+    several = len({row.limit.record.variant for row in rows}) > 1
+    limits = []
+    for row in rows:
+        record = row.limit.record
+        label = f"{record.detector}, {record.variant}" if several else record.detector
+        limits.append(replace(row.limit, record=replace(record, variant=label)))
     drawn = figure({"limits": limits_figure(limits)}, "limits", caption)
     body = [
         drawn,
@@ -177,13 +187,11 @@ def leaderboard_html(rows: Sequence[Ranked], command: str) -> str:
         *command_of(command),
     ]
     boards = rows[0].limit.boards
-    conditions = f"Maps of {many(boards, 'damaged board')} in the first category, judged by a90."
+    conditions = (
+        f"Maps of {many(boards, 'damaged board')} in the first category, judged by a90. All methods"
+        " see the same boards: tofpod compare tests two of them damage by damage."
+    )
     return page("Leaderboard", answer(rows), body, [note(conditions)])
-
-
-def _label(row: Ranked) -> str:
-    """Return method and category, for the figure."""
-    return f"{row.limit.record.detector}, {row.limit.record.variant}"
 
 
 RANK = Program(

@@ -68,7 +68,9 @@ def test_the_smallest_a90_comes_first(scored: Path, tmp_path: Path):
     assert rows["rank"].tolist() == [1, 2]
     assert rows["au_pro"][0] > 0.9 > rows["au_pro"][1]
     page = (tmp_path / "leaderboard.html").read_text()
-    assert "tiny: thesis, a90" in page and "tofpod score detector NAME" in page
+    a90_mm = f"{rows['a90_mm'][0]:.1f}"
+    assert f"thesis finds damage of {a90_mm}" in page
+    assert "tofpod score detector NAME" in page
 
 
 def test_methods_on_other_boards_or_of_one_name_are_refused(
