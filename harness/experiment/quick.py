@@ -1,7 +1,7 @@
 """The overrides of a first look, ``--quick``: fewer repeats, boards, and values on long axes."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import ceil, prod
 from typing import Any
 
@@ -20,7 +20,11 @@ MOST_VIEWS = 100
 """Most views to render: one takes 0.2 to 0.5 s of processor time, and a first page is to come
 within a minute of two cores."""
 MOST_JUDGEMENTS = 180
-"""Most judgements of a board by a set-up: one takes 0.2 to 0.6 s with its share of the frames."""
+"""Most judgements of a board by a set-up: one takes 0.2 to 0.4 s of processor time with its share
+of the frames."""
+DETECTORS = "detector.name"
+JUDGEMENTS_OF = {"m3c2": 2, "fpfh_memory": 3}
+"""For how many judgements one by a slower detector counts: it takes 0.6 and 0.9 s."""
 LEAST_DRAWS = 2
 CALIBRATION_REPEATS = "threshold.calibrate.repeats"
 CALIBRATED_BOARDS = "threshold.calibrate.boards"
@@ -99,8 +103,8 @@ def _fewer_set_ups(data: Any, views: int, trials: int) -> list[str]:
         affordable = min(MOST_VIEWS // views, MOST_JUDGEMENTS // (trials * set_ups))
         return [f"draws={min(draws, max(affordable, LEAST_DRAWS))}"]
     of_source = {path: values for path, values in axes.items() if path.startswith(SOURCE)}
-    thinned = axes | _thinned(of_source, MOST_VIEWS // views)
-    thinned = _thinned(thinned, MOST_JUDGEMENTS // trials)
+    thinned = axes | _thinned(of_source, MOST_VIEWS // views, _set_ups)
+    thinned = _thinned(thinned, MOST_JUDGEMENTS // trials, _judgements)
     overrides = []
     for path, values in thinned.items():
         if len(values) < len(axes[path]):
@@ -113,15 +117,27 @@ def _set_ups(axes: Axes) -> int:
     return prod(len(values) for values in axes.values())
 
 
-def _thinned(axes: Axes, most: int) -> Axes:
-    """Return axes with at most ``most`` set-ups, at least one: the longest axis, of equals the
-    last, loses a value, and so on. An axis keeps its ends and even steps between them."""
+def _judgements(axes: Axes) -> int:
+    """Return the number of judgements of a board by all combinations of values."""
+    others = {path: values for path, values in axes.items() if path != DETECTORS}
+    names = axes.get(DETECTORS, [""])
+    return _set_ups(others) * sum(JUDGEMENTS_OF.get(str(name), 1) for name in names)
+
+
+def _thinned(axes: Axes, most: int, counted: Callable[[Axes], int]) -> Axes:
+    """Return axes that are ``counted`` as at most ``most``, with at least one set-up: the longest
+    axis, of equals the last, loses a value, and so on. An axis keeps its ends and even steps
+    between them."""
     lengths = {path: len(values) for path, values in axes.items()}
-    while prod(lengths.values()) > max(most, 1):
+    thinned = axes
+    while counted(thinned) > most and _set_ups(thinned) > 1:
         longest = max(reversed(lengths), key=lambda path: lengths[path])
         lengths[longest] -= 1
-    thinned = {}
-    for path, values in axes.items():
-        indices = np.linspace(0, len(values) - 1, lengths[path]).round().astype(int)
-        thinned[path] = [values[index] for index in indices]
+        thinned = {path: _even_steps(values, lengths[path]) for path, values in axes.items()}
     return thinned
+
+
+def _even_steps(values: list[Any], count: int) -> list[Any]:
+    """Return so many of the values, in even steps from the first to the last."""
+    places = np.linspace(0, len(values) - 1, count).round().astype(int)
+    return [values[place] for place in places]

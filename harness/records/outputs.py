@@ -27,6 +27,10 @@ class Output:
 REPORT = Output("report.html", "the report: a single file that can be read offline")
 EXPERIMENT = Output("experiment.yaml", "the experiment with every default written out")
 PROVENANCE = Output("provenance.json", "command, commit, versions, seed, machine, failures")
+WRITTEN = Output(
+    "written.json",
+    "digests of the other files, by which the same command sees that all are written",
+)
 STUDY = Output(
     "study.json", "every inspection of every set-up: what `tofpod compare` reads", of="study"
 )
@@ -81,6 +85,7 @@ FILES = (
     REPORT,
     EXPERIMENT,
     PROVENANCE,
+    WRITTEN,
     STUDY,
     LEARNED,
     MAPS,

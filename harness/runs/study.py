@@ -44,6 +44,7 @@ from harness.runs.run import run_plan
 from harness.runs.shards import Shard, locked
 from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of, write_tables
+from harness.runs.written import Written, origin_of
 from harness.tables.study import study_tables
 from harness.vocabulary.code_digests import remembered
 from harness.vocabulary.errors import UserError
@@ -112,28 +113,23 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                 return _shard_over(options.shard, outcome, folder)
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
-            print("writing tables and report", file=sys.stderr)
             bill.begin("tables and page")
-            tables = tables_of(journal.records(outcome.finished), experiment)
-            provenance = _provenance(experiment, plan, outcome, tables, origin)
-            provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
-            write_tables(folder, tables.stored(), provenance)
-            if experiment.config.study is None:
-                shown = _write_report(folder, experiment, outcome, tables, provenance)
-            else:
-                shown = _write_study(
+            results = origin_of(outcome, resolved_yaml(experiment), origin["digests"])
+            written = Written(folder, results)
+            shown = written.shown_again(outcome)
+            if shown is None:
+                print("writing tables and report", file=sys.stderr)
+                shown = _write_results(
                     folder,
                     experiment=experiment,
                     plan=plan,
                     outcome=outcome,
-                    tables=tables,
-                    provenance=provenance,
                     journal=journal,
                     engine=engine,
+                    origin=origin,
+                    began=began,
                 )
-            bill.divide_trials(_frames_share(tables))
-            provenance[BILL] = bill.rounded()
-            write_json(folder / PROVENANCE.name, provenance)
+                written.store(shown)
         if options.cache_limit_gb is not None:
             limit_bytes = round(options.cache_limit_gb * 1e9)
             trim_cache(cache, limit_bytes, keep=[render.path for render in plan.renders])
@@ -142,7 +138,7 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
         print(text, file=sys.stderr)
         return 130
     point_to(folder)
-    show([*(f"warning: {text}" for text in provenance["warnings"]), *shown])
+    show(shown)
     _print_failures(outcome)
     print(bill.in_words(), file=sys.stderr)
     print(f"report: {folder / REPORT.name}")
@@ -170,6 +166,42 @@ def _refuse_newer(folder: Path) -> None:
         return
     if type(version) is int and version > RESULTS_VERSION:
         check_version(version, RESULTS_VERSION, folder / PROVENANCE.name, "a result folder")
+
+
+def _write_results(
+    folder: Path,
+    *,
+    experiment: Experiment,
+    plan: SweepPlan,
+    outcome: Outcome,
+    journal: Journal,
+    engine: Metered,
+    origin: dict[str, Any],
+    began: float,
+) -> list[str | Grid]:
+    """Write tables, report and provenance of a run that ``began`` then. Return what the terminal
+    shows."""
+    tables = tables_of(journal.records(outcome.finished), experiment)
+    provenance = _provenance(experiment, plan, outcome, tables, origin)
+    provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
+    write_tables(folder, tables.stored(), provenance)
+    if experiment.config.study is None:
+        answer = _write_report(folder, experiment, outcome, tables, provenance)
+    else:
+        answer = _write_study(
+            folder,
+            experiment=experiment,
+            plan=plan,
+            outcome=outcome,
+            tables=tables,
+            provenance=provenance,
+            journal=journal,
+            engine=engine,
+        )
+    engine.bill.divide_trials(_frames_share(tables))
+    provenance[BILL] = engine.bill.rounded()
+    write_json(folder / PROVENANCE.name, provenance)
+    return [*(f"warning: {text}" for text in provenance["warnings"]), *answer]
 
 
 def _write_study(

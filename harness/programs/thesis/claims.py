@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.stats import rankdata
 
 from harness.evaluation.intervals import Interval, bootstrap, mean_difference, standardised_bias
 from harness.evaluation.maps import CAMERA_UNIT, MANY, span
@@ -271,8 +270,8 @@ def _size_error(row: pd.Series) -> str:
 def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Return Spearman's rho and the one-sided permutation p of "y falls as x grows", exact up to 8
     pairs, or (0, 1)."""
-    x_ranks = rankdata(x)
-    y_ranks = rankdata(y)
+    x_ranks = _ranks(x)
+    y_ranks = _ranks(y)
     if np.ptp(x_ranks) == 0 or np.ptp(y_ranks) == 0:
         return 0.0, 1.0
     x_centred = x_ranks - x_ranks.mean()
@@ -282,6 +281,14 @@ def falling_rank(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     by_chance = x_centred[_orders(len(x_centred))] @ y_centred
     p = (by_chance <= product + 1e-12 * norm).mean()
     return float(product / norm), float(p)
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """Return the rank (n,) of each value from 1; equal values share the mean of theirs."""
+    ordered = np.sort(values)
+    below = np.searchsorted(ordered, values, "left")
+    at_most = np.searchsorted(ordered, values, "right")
+    return np.asarray((below + at_most + 1) / 2)
 
 
 @lru_cache

@@ -95,6 +95,12 @@ def test_the_quick_run_of_every_shipped_experiment_is_small(file: Path, tmp_path
     assert len(set_ups) * boards <= quick.MOST_JUDGEMENTS
 
 
+def test_slow_detectors_count_for_several_in_a_quick_run() -> None:
+    first_look = load_experiment(FOLDER / "detectors.yaml", quick=True)
+    names = {point.config.detector.name for point in first_look.points}
+    assert names == {"thesis", "fpfh_memory"}, "its ends; four fast ones would fit"
+
+
 def test_a_quick_run_has_the_ends_of_long_axes() -> None:
     today = load_experiment(FOLDER / "today.yaml", quick=True).config
     assert today.sweep["source.camera.name"] == ("azure_kinect_nfov", "vzense_ds86")

@@ -78,6 +78,7 @@ def test_a_sweep_leaves_all_its_files(finished):
         "set_ups.parquet",
         "summary.csv",
         "trials.parquet",
+        "written.json",
     }
     assert_declared(results(finished))
     latest = finished / "tiny" / "latest"

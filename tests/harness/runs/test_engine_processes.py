@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
+from harness.runs import processes
 from harness.runs.jobs import STATES, Ended, Job, JobEngine, Limits, attempt
 from harness.runs.processes import LocalEngine, SerialEngine
 from harness.vocabulary import system
@@ -118,6 +119,16 @@ def test_the_peak_of_memory_is_the_jobs_own():
 
 def test_trial_processes_load_neither_mitsuba_nor_open3d():
     assert run(LocalEngine(1, Limits()), [job(faulty_jobs.imported)])["imported"].value == []
+
+
+def test_what_renders_is_loaded_only_where_a_render_is_expected(monkeypatch):
+    started = []
+    monkeypatch.setattr(processes, "start_server", started.append)
+    for renders in (True, False):
+        with LocalEngine(1, Limits(), renders=renders):
+            pass
+    both = ("harness.trials.trial", "scenes.render.view")
+    assert started == [both, both[:1]]
 
 
 OTHER_FOLDER = """

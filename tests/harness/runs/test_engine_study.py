@@ -40,7 +40,7 @@ from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
 from tests.support.declared_results import assert_declared
 from tests.support.serial_run import records_of, run_serially
-from tests.support.tiny_sweep import STUDY, results
+from tests.support.tiny_sweep import STUDY, results, sweep
 
 
 def written(folder: Path, text: str = STUDY) -> Path:
@@ -297,6 +297,25 @@ def set_ups_of(record: StudyRecord) -> object:
     return record.to_data()["set_ups"]
 
 
+def test_a_finished_study_shows_its_results_again_and_writes_a_missing_file(finished, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(finished, out, symlinks=True)
+    yaml = finished.parent / "tiny.yaml"
+    told = (finished.parent / "told.txt").read_text()
+    page = results(out) / "report.html"
+    page.write_text("changed by hand")
+    anew = sweep(yaml, out, "--serial")
+    assert "writing tables and report" in anew.stderr
+    written = page.stat().st_mtime_ns
+    again = sweep(yaml, out, "--serial")
+    assert "writing tables and report" not in again.stderr
+    assert page.stat().st_mtime_ns == written
+    for done in (anew, again):
+        assert done.returncode == 0
+        # all but the place of the report
+        assert done.stdout.splitlines()[:-1] == told.splitlines()[:-1]
+
+
 def test_a_serial_and_a_resumed_study_give_the_same_record(finished, tmp_path, monkeypatch):
     parallel = set_ups_of(read_record(results(finished)))
     serial, _ = judged(finished.parent, tmp_path / "serial", monkeypatch)
@@ -317,6 +336,7 @@ def test_pictures_of_damage_are_drawn_once(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(finished, out, symlinks=True)
     before = examples_on(results(out))
+    (results(out) / "report.html").unlink()
 
     def is_drawn(shown: object, thresholds: object) -> None:
         raise AssertionError("drawn again")
