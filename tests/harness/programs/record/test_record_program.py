@@ -17,7 +17,7 @@ import pytest
 
 from detectors import sources
 from detectors.recordings import open_capture
-from detectors.sources.interface import Stream
+from detectors.sources.interface import Stream, without_frames
 from harness import detect
 from harness.programs.record import record
 from harness.programs.record.watching import WarmUp, Watch, drift_of
@@ -182,6 +182,25 @@ def test_a_camera_is_recorded_until_ctrl_c_and_detect_reads_it_without_an_option
     assert "is there already" in capsys.readouterr().err
 
 
+def test_what_came_before_a_camera_fell_silent_is_kept(tmp_path: Path, capsys, monkeypatch):
+    @contextmanager
+    def opened(path: Path | None) -> Iterator[Stream]:
+        def frames() -> Iterator[Frame]:
+            yield from (frame(number) for number in range(15))
+            raise without_frames("simulated")
+
+        yield Stream("simulated", LENS, 1e-4, frames())
+
+    monkeypatch.setitem(sys.modules, "simulated_camera", SimpleNamespace(opened=opened))
+    monkeypatch.setitem(sources.BUILT_IN, "simulated", "simulated_camera:opened")
+    out = tmp_path / "out"
+    assert record.main(["--camera", "simulated", "--out", str(out)]) == 2
+    assert "no frame came" in capsys.readouterr().err
+    facts = json.loads((out / "recording.json").read_text())
+    assert facts["frames"] == 15 and [second["frames"] for second in facts["seconds"]] == [10, 15]
+    assert len(list((out / "depth").glob("*.png"))) == 15
+
+
 def test_only_watching_writes_nothing(tmp_path: Path, capsys, monkeypatch):
     stored = plane.write_open3d_folder(tmp_path / "stored", 3)
     monkeypatch.chdir(tmp_path)
@@ -195,6 +214,7 @@ def test_only_watching_writes_nothing(tmp_path: Path, capsys, monkeypatch):
         ([], "nothing is named that gives frames"),
         (["--from", "nowhere"], "no such file or folder"),
         (["--camera", "kinect"], "there is no camera to record with 'kinect'"),
+        (["--camera", "oak", "--unit", "mm"], "--unit: concerns files that tofpod reads"),
         (["--from", "cloud.ply"], "holds points, not depth images"),
         (["--from", "cloud.ply", "--rate", "0"], "--rate 0"),
     ],
