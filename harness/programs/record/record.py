@@ -129,9 +129,12 @@ def _stream(options: argparse.Namespace) -> Iterator[Stream]:
     from detectors.sources import open_source
     from detectors.sources.interface import Stream
     from harness.inspection.output import print_notes, print_warnings
+    from harness.programs.record.watching import compile_loops
 
     if options.camera is not None:
-        with open_source(options.camera, options.source) as stream:
+        source = open_source(options.camera, options.source)
+        compile_loops()
+        with source as stream:
             yield stream
         return
     recording = opened([options.source], options.intrinsics, **reading_of(options))
