@@ -12,8 +12,8 @@ import pytest
 import detectors
 from detectors import detector_names, detector_type, load_detector
 from detectors.filters import filter_names
-from detectors.sources import SOURCES
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
+from detectors.sources import SOURCES
 from harness import __version__
 from harness.programs.keeping.ls import main
 from harness.vocabulary.errors import UserError
