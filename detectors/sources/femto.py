@@ -63,7 +63,8 @@ def _pictures(sdk: Any, pipeline: Any) -> Iterator[DepthPicture]:
         yield DepthPicture(
             time_s=1e-6 * depth.get_timestamp_us(),
             stored=_numbers(depth),
-            unit_m=MM * depth.get_depth_scale(),
+            # stated as a 32-bit number
+            unit_m=round(MM * depth.get_depth_scale(), 9),
             lens=_lens(sdk, depth.get_stream_profile().as_video_stream_profile()),
             amplitude=_numbers(infrared) if is_16_bit else None,
         )

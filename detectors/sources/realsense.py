@@ -32,7 +32,7 @@ INSTALL = "pip install 'tofpod[realsense]'; on Linux also the system's package l
 
 @contextmanager
 def open_realsense(path: Path | None) -> Iterator[Stream]:
-    """Start the first camera with its default depth stream, or play a .db3 or .bag of its SDK."""
+    """Start the first camera with its default depth stream, or play a recording of its SDK."""
     rs = load_sdk("pyrealsense2", CAMERA, INSTALL)
     pipeline = rs.pipeline()
     config = rs.config()

@@ -224,6 +224,12 @@ OTHERS = (
     Case("ls", "parts/kinect_v2.yaml", ["parts"], ["parts/kinect_v2.yaml"]),
     Case("clean", "results tiny --results runs/out --dry-run", ["runs"],
          ["runs/out/tiny/[0-9a-f]*/*"], weight=2),
+    Case("clean", "results --keep 0GB --results runs/out --dry-run", ["runs"],
+         ["runs/out/tiny/[0-9a-f]*/*"]),
+    Case("record", "--from pngs --out recorded", ["pngs"], weight=2),
+    Case("record", "--from mkv/a.mkv --out recorded --frames 2", ["mkv"], weight=2),
+    Case("record", "--from bag_packed --out recorded", ["bag_packed"], weight=2),
+    Case("record", "--from npz/depth.npz", ["npz"], weight=2),
     Case("clean", "cache --all --results runs/out --dry-run", ["runs"], ["runs/out/.cache/renders/*"]),
 )  # fmt: skip
 CASES = (*CAPTURES, *REFERENCES, *EARLIER, *LENSES, *VIEWS, *CAMERAS, *EXPERIMENTS, *OTHERS)

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from detectors import DETECTORS, detector_type, load_detector
 from detectors.filters import FILTERS, filter_settings_type, load_filter
+from detectors.sources import SOURCES
 from harness.programs.keeping.written_files import is_output
 from harness.records.outputs import EXPERIMENT, JOURNAL, LATEST, LOCK_NAME, PROVENANCE, RUN_NAME
 from harness.runs.journal import SEGMENT_NAME, Journal
@@ -47,12 +48,18 @@ SETTABLE = {
     "detectors": "settings",
     "filters": "settings",
     "cameras": "numbers",
+    "sources": "settings",
 }  # kinds of offers, and what can be set for each
 
 
 def plug_ins(kind: str) -> PlugIns:
-    """Return the detectors, the filters or the cameras."""
-    return {"detectors": DETECTORS, "filters": FILTERS, "cameras": CAMERAS}[kind]
+    """Return the detectors, the filters, the cameras, or the sources of frames."""
+    return {
+        "detectors": DETECTORS,
+        "filters": FILTERS,
+        "cameras": CAMERAS,
+        "sources": SOURCES,
+    }[kind]
 
 
 def offered(kind: str) -> list[Row]:
@@ -76,7 +83,11 @@ def offered(kind: str) -> list[Row]:
 def shown(kind: str, name: str) -> Row:
     """Return an offer's row with all of its settings. Raises UserError if it is unknown, ambiguous
     or broken."""
-    settable = _numbers(name) if kind == "cameras" else _declared_settings(kind, name)
+    settable = []
+    if kind == "cameras":
+        settable = _numbers(name)
+    elif kind != "sources":
+        settable = _declared_settings(kind, name)
     return {**_origin(plug_ins(kind).offer(name)), **_facts(kind, name), SETTABLE[kind]: settable}
 
 
@@ -121,6 +132,9 @@ def _facts(kind: str, name: str) -> Row:
         }
     if kind == "filters":
         return _facts_of_filter(name)
+    if kind == "sources":
+        about = inspect.getdoc(SOURCES.load(SOURCES.offer(name))) or ""
+        return {"version": None, "about": about.strip().partition("\n")[0]}
     camera = load_camera(name)
     optics = camera.optics
     return {

@@ -21,8 +21,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     add(
         "what",
         nargs="?",
-        help="detectors, filters, cameras, results, cache, artefacts, keys (of experiments); "
-        "or a detector, filter or camera",
+        help="detectors, filters, cameras, sources (cameras to record with), results, cache, "
+        "artefacts, keys (of experiments); or the name of one of the first four",
     )
     add(
         "name",
@@ -41,9 +41,9 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "List detectors, filters and cameras: tofpod's own and those that installed packages offer "
-    "through the entry point "
-    "groups tofpod.detectors, tofpod.filters and tofpod.cameras. Or list results folders, the "
+    "List detectors, filters, cameras, and sources of frames to record: tofpod's own and those "
+    "that installed packages offer through the entry point groups tofpod.detectors, "
+    "tofpod.filters, tofpod.cameras and tofpod.sources. Or list results folders, the "
     "cache of renders, the age of stored answers (artefacts), or all keys of an experiment.",
     "tofpod ls cameras kinect_v2",
     "tofpod ls thesis",
@@ -60,7 +60,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 
 
 def _list_offers(options: argparse.Namespace) -> int:
-    """List detectors and cameras, or the settings of a named one. Raises UserError for an unknown
+    """List all offers, or the settings of a named one. Raises UserError for an unknown
     name."""
     from harness.programs.keeping.listing import (
         SETTABLE,
@@ -120,7 +120,9 @@ def _list_offers(options: argparse.Namespace) -> int:
             if kind != "cameras"
             else ("number", "value", "tag and source")
         )
-        show([grid_of(kind, [row]), "", Grid.of(heads, settable, left=3)])
+        show([grid_of(kind, [row])])
+        if settable:
+            show(["", Grid.of(heads, settable, left=3)])
     return 0
 
 

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.inspection.arguments import add_reading, opened, reading_of
+from harness.inspection.arguments import READING, add_reading, opened, reading_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program, whole_number
 
@@ -53,45 +53,58 @@ def _options(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, also after Ctrl-C, which ends a recording; 2 for a user's
     mistake."""
-    from harness.programs.record.watching import Watch
-    from harness.programs.record.writing import FrameFolder
-    from harness.vocabulary.provenance import record
-    from harness.vocabulary.text import many
-
     if not options.rate > 0:
         raise UserError(f"--rate {options.rate:g}", legal="a number above 0 (frames per second)")
     if options.camera is None and options.source is None:
         fix = "name a camera with --camera, or a recorded file with --from"
         raise UserError("nothing is named that gives frames", fix=fix)
+    for name in ("intrinsics", *READING):
+        if options.camera is not None and getattr(options, name) is not None:
+            problem = f"--{name}: concerns files that tofpod reads, not the camera {options.camera}"
+            raise UserError(problem, fix=f"leave out --{name}, or --camera")
+    with _stream(options) as stream:
+        _record(stream, options, command)
+    return 0
+
+
+def _record(stream: Stream, options: argparse.Namespace, command: str) -> None:
+    """Watch a stream and write its frames. Raises UserError, after what came has been written."""
+    from harness.programs.record.watching import Watch
+    from harness.programs.record.writing import LARGEST, FrameFolder
+    from harness.vocabulary.provenance import record
+    from harness.vocabulary.text import many
+
+    folder = FrameFolder(options.out, stream) if options.out else None
+    watch = Watch(stream)
     seconds = []
     times_s: list[float] = []
     are_stated = True
-    with _stream(options) as stream:
-        folder = FrameFolder(options.out, stream) if options.out else None
-        print(f"{stream.name}: {stream.lens.width} x {stream.lens.height} pixels", flush=True)
-        watch = Watch(stream)
-        try:
-            for frame in islice(stream.frames, options.frames):
-                are_stated = are_stated and frame.time_s is not None
-                time_s = len(times_s) / options.rate if frame.time_s is None else frame.time_s
-                times_s.append(time_s)
-                if folder:
-                    folder.add(frame)
-                if (second := watch.add(frame, time_s)) is not None:
-                    seconds.append(second)
-                    print(second.line, flush=True)
-        except KeyboardInterrupt:
-            print("ended by Ctrl-C", flush=True)
-    if (second := watch.ended()) is not None:
+    failure = None
+    print(f"{stream.name}: {stream.lens.width} x {stream.lens.height} pixels", flush=True)
+    try:
+        for frame in islice(stream.frames, options.frames):
+            are_stated = are_stated and frame.time_s is not None
+            time_s = len(times_s) / options.rate if frame.time_s is None else frame.time_s
+            times_s.append(time_s)
+            if folder:
+                folder.add(frame)
+            second = watch.add(frame, time_s)
+            if second is not None:
+                seconds.append(second)
+                print(second.line, flush=True)
+    except KeyboardInterrupt:
+        print("ended by Ctrl-C", flush=True)
+    except UserError as error:
+        failure = error
+    second = watch.ended()
+    if second is not None:
         seconds.append(second)
         print(second.line)
-    if not times_s:
-        raise UserError(f"{stream.name}: gave no frame")
     if not are_stated:
         print(f"the frames state no times: {options.rate:g} a second are assumed")
-    if folder:
+    if folder and times_s:
         if folder.beyond:
-            reach = f"{65534 * stream.unit_m:.3g} m"
+            reach = f"{LARGEST * stream.unit_m:.3g} m"
             warning = f"{folder.beyond} distances beyond {reach} are left out"
             print(f"warning: {warning}", file=sys.stderr)
         facts = {
@@ -105,7 +118,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         }
         folder.finish(facts)
         print(f"{many(len(times_s), 'frame')} in {options.out}: tofpod detect {options.out}")
-    return 0
+    if failure is not None:
+        raise failure
 
 
 @contextmanager
@@ -115,9 +129,12 @@ def _stream(options: argparse.Namespace) -> Iterator[Stream]:
     from detectors.sources import open_source
     from detectors.sources.interface import Stream
     from harness.inspection.output import print_notes, print_warnings
+    from harness.programs.record.watching import compile_loops
 
     if options.camera is not None:
-        with open_source(options.camera, options.source) as stream:
+        source = open_source(options.camera, options.source)
+        compile_loops()
+        with source as stream:
             yield stream
         return
     recording = opened([options.source], options.intrinsics, **reading_of(options))

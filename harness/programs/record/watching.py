@@ -14,7 +14,7 @@ from detectors.recordings import Recording
 from detectors.sources.interface import Stream
 from harness.stills.statistics import temporal_sigma_m
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Frame
+from harness.vocabulary.geometry import MM, Frame, Lens
 
 PERIOD_S = 1.0
 """Time between two lines."""
@@ -197,6 +197,19 @@ class Watch:
         most_m = max(RECORDED.changed_sigmas * noise_m, RECORDED.changed_mm * MM)
         is_same = np.abs(after_m - before_m) <= most_m
         return bool((~is_same).mean() > RECORDED.disturbed_fraction)
+
+
+def compile_loops() -> None:
+    """Watch two frames of a plate, so that no loop is compiled while a camera sends frames: this
+    takes some 20 s after an installation, and half a second later."""
+    lens = Lens(width=96, height=72, fx=100.0, fy=100.0, cx=47.5, cy=35.5)
+    z_m = np.full((lens.height, lens.width), 1.0, np.float32)
+    z_m[16:56, 24:72] = 0.7
+    frame = Frame("plate", z_m, np.zeros(z_m.shape, np.uint8))
+    watch = Watch(Stream("plate", lens, MM, iter(())))
+    watch.add(frame, 0.0)
+    watch.add(frame, 0.1)
+    watch.ended()
 
 
 def _mean(stack_m: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import detectors
 from detectors import detector_names, detector_type, load_detector
 from detectors.filters import filter_names
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
+from detectors.sources import SOURCES
 from harness import __version__
 from harness.programs.keeping.ls import main
 from harness.vocabulary.errors import UserError
@@ -278,7 +279,13 @@ def test_everything_is_listed_with_where_it_comes_from(acme_camera, capsys):
         for line in out.splitlines()
         if line and "(entry" not in line and not line.startswith("name ")
     }
-    assert set(lines) == {*OWN_DETECTORS, *filter_names(), *camera_names()}
+    assert set(lines) - {"results", "cache:"} == {
+        *OWN_DETECTORS,
+        *filter_names(),
+        *camera_names(),
+        *SOURCES.names(),
+    }
+    assert "Start the first camera" in lines["oak"]
     assert (
         f"tofpod {__version__}" in lines["thesis"]
         and f" {ThesisDetector.version} " in lines["thesis"]

@@ -17,7 +17,7 @@ import pytest
 
 from detectors import sources
 from detectors.recordings import open_capture
-from detectors.sources.interface import Stream
+from detectors.sources.interface import Stream, without_frames
 from harness import detect
 from harness.programs.record import record
 from harness.programs.record.watching import WarmUp, Watch, drift_of
@@ -74,11 +74,12 @@ def test_noise_fill_rate_and_the_target_of_each_second():
 
 
 def test_a_target_at_the_pictures_edge_is_cut_off_and_one_that_moves_is_sought_again():
-    frames = [frame(i, left_px=0 if i < 10 else 40) for i in range(20)]
-    first, second = watched(iter(frames))
-    assert first.target.is_whole and not first.is_new
-    assert second.is_new and not second.target.is_whole
-    assert "cut off by the picture's edge" in second.line
+    *_, before, after = watched(frame(i, left_px=0 if i < 60 else 40) for i in range(70))
+    assert before.target.is_whole and not before.is_new and not np.isnan(before.drift.per_s)
+    assert after.is_new and not after.target.is_whole
+    assert "cut off by the picture's edge" in after.line
+    # a drift from one place to the other would be none
+    assert after.drift.change_m == 0 and np.isnan(after.drift.per_s)
 
 
 def test_without_a_surface_no_target_is_in_view():
@@ -171,15 +172,36 @@ def test_a_camera_is_recorded_until_ctrl_c_and_detect_reads_it_without_an_option
     out = tmp_path / "out"
     assert record.main(["--camera", "simulated", "--out", str(out)]) == 0
     assert "ended by Ctrl-C" in capsys.readouterr().out
-    frames = list(open_capture([out]).frames())
+    copy = open_capture([out])
+    frames = list(copy.frames())
     assert len(frames) == 60 and frames[7].amplitude is not None
     assert frames[7].amplitude[0, 0] == 507
+    assert len(copy.files) == 60 + 60 + 1
     assert detect.main([str(out), "--detector", "matched"]) == 0
     found = capsys.readouterr().out
     assert "depth unit 0.1 mm, from intrinsic.json" in found
     assert found.startswith("One hole found")
     assert record.main(["--camera", "simulated", "--out", str(out)]) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+def test_what_came_before_a_camera_fell_silent_is_kept(tmp_path: Path, capsys, monkeypatch):
+    @contextmanager
+    def opened(path: Path | None) -> Iterator[Stream]:
+        def frames() -> Iterator[Frame]:
+            yield from (frame(number) for number in range(15))
+            raise without_frames("simulated")
+
+        yield Stream("simulated", LENS, 1e-4, frames())
+
+    monkeypatch.setitem(sys.modules, "simulated_camera", SimpleNamespace(opened=opened))
+    monkeypatch.setitem(sources.BUILT_IN, "simulated", "simulated_camera:opened")
+    out = tmp_path / "out"
+    assert record.main(["--camera", "simulated", "--out", str(out)]) == 2
+    assert "no frame came" in capsys.readouterr().err
+    facts = json.loads((out / "recording.json").read_text())
+    assert facts["frames"] == 15 and [second["frames"] for second in facts["seconds"]] == [10, 15]
+    assert len(list((out / "depth").glob("*.png"))) == 15
 
 
 def test_only_watching_writes_nothing(tmp_path: Path, capsys, monkeypatch):
@@ -195,6 +217,7 @@ def test_only_watching_writes_nothing(tmp_path: Path, capsys, monkeypatch):
         ([], "nothing is named that gives frames"),
         (["--from", "nowhere"], "no such file or folder"),
         (["--camera", "kinect"], "there is no camera to record with 'kinect'"),
+        (["--camera", "oak", "--unit", "mm"], "--unit: concerns files that tofpod reads"),
         (["--from", "cloud.ply"], "holds points, not depth images"),
         (["--from", "cloud.ply", "--rate", "0"], "--rate 0"),
     ],
@@ -216,3 +239,6 @@ def test_distances_that_do_not_fit_are_told(tmp_path: Path, capsys):
     assert record.main(["--from", str(tmp_path / "far.npy"), "--out", str(out)]) == 0
     assert "warning: 1500 distances beyond 6.55 m are left out" in capsys.readouterr().err
     assert json.loads((out / "recording.json").read_text())["distances_left_out"] == 1500
+    (copied, *_) = open_capture([out]).frames()
+    np.testing.assert_allclose(copied.z_m[:30], z_m[0, :30], atol=0.06 * MM)
+    assert np.isnan(copied.z_m[30:]).all()

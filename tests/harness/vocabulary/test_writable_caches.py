@@ -1,4 +1,4 @@
-"""An installation that cannot be written: loops are compiled where they are used, and kept where
+"""An installation that cannot be written: what Numba compiles and Matplotlib lists is kept where
 the user may write."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.vocabulary import compiled_loops
+from harness.vocabulary import writable_caches
 from tests.support import recorded_plane as plane
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -62,42 +62,41 @@ def run(installed: Path, *words: str, **variables: str) -> str:
 
 
 MEDIANS = (
-    "import numpy as np\n"
+    "import os\n"
     "import detectors.pixels.medians as medians\n"
     "assert medians.__file__.startswith(sys.path[0])\n"
-    "import os; print(os.environ.get('NUMBA_CACHE_DIR'))\n"
+    "print(os.environ['NUMBA_CACHE_DIR'], os.environ['MPLCONFIGDIR'])\n"
 )
 
 
-def test_loops_of_a_read_only_installation_are_kept_in_the_stated_folder(
-    installed: Path, tmp_path: Path
-):
-    stated = tmp_path / "loops"
-    assert run(installed, MEDIANS, NUMBA_CACHE_DIR=str(stated)).strip() == str(stated)
+def test_a_read_only_installation_uses_the_stated_folders(installed: Path, tmp_path: Path):
+    loops = str(tmp_path / "loops")
+    fonts = str(tmp_path / "fonts")
+    assert run(installed, MEDIANS, NUMBA_CACHE_DIR=loops, MPLCONFIGDIR=fonts).split() == [
+        loops,
+        fonts,
+    ]
 
 
-def test_without_any_place_they_are_kept_in_a_private_temporary_folder(
-    installed: Path, tmp_path: Path
-):
+def test_without_any_place_a_private_temporary_folder_is_used(installed: Path, tmp_path: Path):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    kept = Path(run(installed, MEDIANS, TMPDIR=str(temporary)).strip())
-    assert kept.parent == temporary
-    assert stat.S_IMODE(kept.stat().st_mode) == 0o700
+    loops, fonts = map(Path, run(installed, MEDIANS, TMPDIR=str(temporary)).split())
+    assert loops == fonts and loops.parent == temporary
+    assert stat.S_IMODE(loops.stat().st_mode) == 0o700
     # somebody else has taken the name: nothing is loaded from there
-    kept.chmod(0o777)
-    other = Path(run(installed, MEDIANS, TMPDIR=str(temporary)).strip())
-    assert other.parent == temporary and other != kept
+    loops.chmod(0o777)
+    other = Path(run(installed, MEDIANS, TMPDIR=str(temporary)).split()[0])
+    assert other.parent == temporary and other != loops
 
 
-def test_a_folder_that_numba_has_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv(compiled_loops.VARIABLE, raising=False)
-    compiled_loops.keep_loops_where_writable()
-    assert compiled_loops.VARIABLE not in os.environ
-    monkeypatch.setattr(compiled_loops, "_can_be_written", lambda place: place == tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    compiled_loops.keep_loops_where_writable()
-    assert compiled_loops.VARIABLE not in os.environ
+def test_places_of_their_own_are_left_to_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for variable in (writable_caches.NUMBA, writable_caches.MATPLOTLIB):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    writable_caches.use_writable_caches()
+    assert not {writable_caches.NUMBA, writable_caches.MATPLOTLIB} & set(os.environ)
 
 
 @pytest.mark.slow
