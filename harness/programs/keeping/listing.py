@@ -345,7 +345,7 @@ def described(run: Path) -> dict[str, Any]:
         with contextlib.suppress(OSError):
             size_bytes += path.lstat().st_size
     row: dict[str, Any] = {
-        "path": str(run),
+        "path": run.as_posix(),
         "experiment": run.parent.name,
         "digest": run.name,
         "state": "broken",
