@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -242,6 +243,15 @@ def test_only_one_module_asks_for_the_operating_system():
                 assert asked not in ("sys.platform", "os.name", "os.fork", "os.kill"), path
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 assert not node.value.startswith(("/proc/", "/dev/")), path
+
+
+STORED_PATH = re.compile(r'"(?:path|file|files|folder|recordings)": \[?str\(')
+
+
+def test_stored_paths_are_written_alike_on_every_system():
+    assert STORED_PATH.search('{"path": str(path)}')
+    for path in sources():
+        assert not STORED_PATH.search(path.read_text()), f"{path}: as_posix() writes slashes"
 
 
 def test_class_names_have_one_meaning():

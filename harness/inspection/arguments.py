@@ -258,7 +258,7 @@ def drawing_file_of(arguments: argparse.Namespace) -> DrawingFile:
     from detectors.surfaces.drawing import DrawingFile
     from harness.vocabulary.declaration.diagnose import settings_of
 
-    data: dict[str, Any] = {"file": str(arguments.reference)}
+    data: dict[str, Any] = {"file": arguments.reference.as_posix()}
     for assignment in arguments.set:
         if assignment.startswith(DRAWING_PREFIX):
             assign(data, assignment.removeprefix(DRAWING_PREFIX))

@@ -231,7 +231,7 @@ def _capture_facts(run: Inspection) -> dict[str, Any]:
 def _file_facts(path: Path) -> dict[str, str]:
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {"path": str(path), "sha256": digest}
+    return {"path": path.as_posix(), "sha256": digest}
 
 
 # ---------------------------------------------------------------- the page

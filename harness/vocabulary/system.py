@@ -182,6 +182,26 @@ def has_nvidia_driver() -> bool:
     return sys.platform == "win32" or any(place.exists() for place in places)
 
 
+LLVM_PLACES = {
+    "linux": (("lib",), "libLLVM.so.*"),
+    "darwin": (("lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib"), "libLLVM*.dylib"),
+    "win32": (("Library/bin", "C:/Program Files/LLVM/bin"), "LLVM-C.dll"),
+}
+"""Folders, those of Python's environment first, and names of LLVM. Conda, Homebrew and the
+installer of llvm.org put it there; Debian's may be too old for Dr.Jit, which then aborts."""
+
+
+def llvm_libraries() -> list[Path]:
+    """Return the libraries of LLVM that this system has at their usual places, the newest first."""
+    folders, name = LLVM_PLACES.get(sys.platform, LLVM_PLACES["linux"])
+    for folder in folders:
+        for root in (Path(sys.prefix), Path(sys.base_prefix)):
+            found = sorted((root / folder).glob(name), key=lambda path: (len(path.name), path.name))
+            if found:
+                return found[::-1]
+    return []
+
+
 # ---------------------------------------------------------------- signals
 
 

@@ -18,11 +18,12 @@ from harness.vocabulary.extras import load_extra
 from scenes.optics import Optics
 from scenes.target.mesh import TargetPart
 
-VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
+VARIANTS = ("cuda_ad_mono", "metal_ad_mono", "llvm_ad_mono")
+"""Fastest first; Mitsuba's wheels contain those that their system may have."""
 LEGAL = "LLVM 17 or newer (14 to 16 abort the process with Dr.Jit 1.5)"
 FIX = (
-    "pip install karellen-llvm-core (Linux x86-64), "
-    "or set DRJIT_LIBLLVM_PATH to the path of such a library"
+    "pip install karellen-llvm-core (Linux x86-64), brew install llvm (macOS) or install LLVM from "
+    "llvm.org (Windows), or set DRJIT_LIBLLVM_PATH to the path of such a library"
 )
 # Dr.Jit uses memory of NumPy as it is, and compiles a kernel for each alignment
 ALIGNED_BYTES = 64
@@ -37,12 +38,13 @@ def load_mitsuba() -> Any:
     # GPU.
     missing = _point_to_llvm()
     mi = load_extra("mitsuba", "a render")
-    if mi.variant() in VARIANTS or _works(mi, "cuda_ad_mono"):
+    if mi.variant() in VARIANTS:
         return mi
-    if missing is not None:
-        raise missing
-    if _works(mi, "llvm_ad_mono"):
-        return mi
+    for variant in VARIANTS:
+        if variant == "llvm_ad_mono" and missing is not None:
+            raise missing
+        if _works(mi, variant):
+            return mi
     if "open3d" in sys.modules:
         # Both wheels contain a libc++.so.1; the first loaded serves both, and Open3D's is too old
         # for LLVM.
@@ -78,9 +80,9 @@ def _works(mi: Any, name: str) -> bool:
 
 
 def _point_to_llvm() -> UserError | None:
-    """Set DRJIT_LIBLLVM_PATH, if it is not set, to the LLVM of the wheel karellen-llvm-core;
-    Dr.Jit's own search may choose one that aborts the process. Return the UserError to raise if no
-    LLVM can be used."""
+    """Set DRJIT_LIBLLVM_PATH, if it is not set, to the LLVM of the wheel karellen-llvm-core or of
+    the system's usual installer; Dr.Jit's own search may choose one that aborts the process.
+    Return the UserError to raise if no LLVM can be used."""
     declared = os.environ.get("DRJIT_LIBLLVM_PATH")
     if declared and Path(declared).exists():
         return None
@@ -90,11 +92,10 @@ def _point_to_llvm() -> UserError | None:
             legal="the path of LLVM 17 or newer",
             fix="set or unset DRJIT_LIBLLVM_PATH",
         )
-    for folder in (Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"):
-        libraries = sorted(folder.glob("libLLVM.so.*"), key=lambda p: (len(p.name), p.name))
-        if libraries:
-            os.environ["DRJIT_LIBLLVM_PATH"] = str(libraries[-1])
-            return None
+    found = system.llvm_libraries()
+    if found:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(found[0])
+        return None
     return UserError(
         "no LLVM was found that Dr.Jit can use",
         legal=LEGAL,

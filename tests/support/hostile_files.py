@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
-from detectors.open3d_library import load_open3d
+from detectors.open3d_library import MissingLibrary, load_open3d
 from detectors.recordings import open_capture
+from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
 from tests.support import recorded_plane as plane
 
@@ -28,16 +28,10 @@ BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
 @contextmanager
 def little_memory() -> Iterator[None]:
     """What would unpack or believe a bomb fails with MemoryError, which is no UserError."""
-    load_open3d()
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(
-        resource.RLIMIT_AS, (pages * resource.getpagesize() + SPARE_BYTES, before[1])
-    )
-    try:
+    with suppress(MissingLibrary):
+        load_open3d()
+    with system.limited_memory(SPARE_BYTES):
         yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def refusal(act: Callable[[], object]) -> str:

@@ -174,7 +174,7 @@ class PodStatement:
         curve = self.curve
         read = self.read
         data = {
-            "file": str(read.path),
+            "file": read.path.as_posix(),
             "kind": self.kind,
             "unit": self.unit,
             "size_column": read.size_column,

@@ -59,7 +59,7 @@ def run_capture(options: argparse.Namespace, command: str) -> int:
     title = f"{capture.name} compared with the simulated {camera.title}"
     facts = {
         "camera": name,
-        "files": [str(path) for path in recording.files],
+        "files": [path.as_posix() for path in recording.files],
         "notes": recording.notes,
     }
     sources = {MEASURED: measured, SIMULATED: twin}

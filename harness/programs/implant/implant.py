@@ -212,7 +212,7 @@ def main(options: argparse.Namespace, command: str) -> int:
             *_shares(options, scanned, peaks_mm),
             *(f"Note: {note}." for note in notes),
         ],
-        "recordings": [str(path) for path in options.paths],
+        "recordings": [path.as_posix() for path in options.paths],
         "camera": options.camera,
         "targets": options.targets,
         "frames": frames,

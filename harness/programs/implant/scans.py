@@ -406,7 +406,7 @@ def judge_scans(
     detector = judge.detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
     set_ups = []
-    files = [str(path) for scan in scans for path in scan.recording.files]
+    files = [path.as_posix() for scan in scans for path in scan.recording.files]
     for count in frames:
         holes = tables.holes[tables.holes["frames"] == count]
         runs = tables.runs[tables.runs["frames"] == count]

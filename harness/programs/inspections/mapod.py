@@ -322,7 +322,7 @@ class Mapod:
         combined = {"size": self.sizes, "pod": middle, "low": low, "high": high}
         data = {
             "set_up": self.set_up,
-            "file": str(self.read.path),
+            "file": self.read.path.as_posix(),
             "prior": {"size": PRIOR_SIZE, "width": PRIOR_WIDTH, "freedom": FREEDOM},
             "simulated": self.simulated.to_data(),
             "measured": None if self.measured is None else self.measured.to_data(),

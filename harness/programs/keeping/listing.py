@@ -355,7 +355,7 @@ def described(run: Path) -> dict[str, Any]:
     """Describe a results folder as JSON types. ``state`` is complete, unfinished, running or
     broken."""
     row: dict[str, Any] = {
-        "path": str(run),
+        "path": run.as_posix(),
         "experiment": run.parent.name,
         "digest": run.name,
         "state": "broken",

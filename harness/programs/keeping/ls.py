@@ -179,7 +179,7 @@ def _list_cache(options: argparse.Namespace) -> int:
     )
     if options.json:
         facts = {
-            "folder": str(folder),
+            "folder": folder.as_posix(),
             "renders": len(renders),
             "size_bytes": size_bytes,
             "leftovers": len(leftover_files),

@@ -319,7 +319,7 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     write_table(options.out, BESIDE, BESIDE.frame(rows))
     body += command_of(command)
     write_text(options.out / "capture.html", page(title, answer, body, under))
-    files = [str(path) for path in recording.files] if recording else []
+    files = [path.as_posix() for path in recording.files] if recording else []
     origin = {
         "results_version": RESULTS_VERSION,
         **record(command),

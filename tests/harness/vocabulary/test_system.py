@@ -133,6 +133,27 @@ def test_the_cause_of_an_end_is_told(code: int, cause: str) -> None:
     assert cause in system.cause_of_end(code)
 
 
+@pytest.mark.parametrize(
+    ("platform", "names"),
+    [
+        ("linux", ("lib/libLLVM.so.9", "lib/libLLVM.so.23.1")),
+        ("darwin", ("lib/libLLVM.dylib", "lib/libLLVM-20.dylib")),
+        ("win32", ("Library/bin/LLVM-C.dll",)),
+    ],
+)
+def test_llvm_is_found_where_each_system_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, platform: str, names: tuple[str, ...]
+) -> None:
+    for prefix in ("prefix", "base_prefix"):
+        monkeypatch.setattr(sys, prefix, str(tmp_path))
+    monkeypatch.setattr(sys, "platform", platform)
+    assert system.llvm_libraries() == []
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert system.llvm_libraries()[0] == tmp_path / names[-1]
+
+
 HELP = """
 from harness.__main__ import MODULES, main
 for name in MODULES:
