@@ -1,5 +1,5 @@
-"""What a reference buys, in one sentence: the headline of a study that compares its boards with
-several references and with none."""
+"""The headline of a study that compares its boards with several references and with none: what a
+reference buys, in one sentence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CHANCE = 0.05
 
 @dataclass(frozen=True)
 class Gain:
-    """What one reference finds beside none, in each kind of set-up."""
+    """The damage found with one reference beside that without, in each kind of set-up."""
 
     name: str
     """The reference, in words."""
