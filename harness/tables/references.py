@@ -42,8 +42,8 @@ def reference_headline(limits: Sequence[SetUpLimit]) -> str:
     helping = [gain for gain in gains if gain.p_values.max() < CHANCE / len(gains)]
     if not helping:
         return (
-            f"No reference clearly helps everywhere: {best.name} finds {_range(best.shares)},"
-            f" going without {_range(best.without)}."
+            f"No reference clearly helps everywhere: {_range(best.shares)} found with {best.name},"
+            f" {_range(best.without)} without."
         )
     best = max(helping, key=lambda gain: float(gain.shares.min()))
     return (

@@ -49,6 +49,9 @@ def test_no_reference_is_praised_for_one_part() -> None:
     limits = limits_of({"flat": (8.0, 8.0, 8.2), "panel": (8.0, 4.0, 4.5)})
     sentence = reference_headline(limits)
     assert sentence.startswith("No reference clearly helps everywhere: ")
+    none_flat, _, _, none_panel, _, _ = limits
+    without = sorted([share(none_flat), share(none_panel)], key=int)
+    assert sentence.endswith(f" {' to '.join(dict.fromkeys(without))} % without.")
     assert len(sentence.split()) <= 20
 
 
