@@ -26,10 +26,9 @@ class TriangleTree(NamedTuple):
     corners: np.ndarray
     # (m,): the number of each of them in the list that the tree is made of
     numbers: np.ndarray
-    # (2 leaves, 3): the lowest corner of each node's box; infinite if it holds no triangle
-    lows: np.ndarray
-    # (2 leaves, 3): the highest corner; minus infinite if it holds no triangle
-    highs: np.ndarray
+    # (2 leaves, 2, 3): the lowest and the highest corner of each node's box, side by side;
+    # infinite and minus infinite if it holds no triangle
+    boxes: np.ndarray
 
 
 def tree_of(corners: np.ndarray) -> TriangleTree:
@@ -51,7 +50,7 @@ def tree_of(corners: np.ndarray) -> TriangleTree:
         first //= 2
         lows[first : 2 * first] = lows[pairs].reshape(-1, 2, 3).min(axis=1)
         highs[first : 2 * first] = highs[pairs].reshape(-1, 2, 3).max(axis=1)
-    return TriangleTree(ordered, order, lows, highs)
+    return TriangleTree(ordered, order, np.stack([lows, highs], axis=1))
 
 
 def _along_curve(places: np.ndarray) -> np.ndarray:
@@ -92,14 +91,13 @@ Vector = tuple[float, float, float]
 def _first_hits(
     corners: np.ndarray,
     numbers: np.ndarray,
-    lows: np.ndarray,
-    highs: np.ndarray,
+    boxes: np.ndarray,
     origins: np.ndarray,
     directions: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     first = np.full(len(origins), -1, np.int64)
     shares = np.zeros((len(origins), 3))
-    leaves = len(lows) // 2
+    leaves = len(boxes) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
     for i in range(len(origins)):
         origin = _row(origins, i)
@@ -110,7 +108,7 @@ def _first_hits(
         reciprocal = (_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2]))
         nearest = np.inf
         waiting[0] = 1
-        size = 1 if _entry(_row(lows, 1), _row(highs, 1), origin, reciprocal) < np.inf else 0
+        size = 1 if _entry(boxes, 1, origin, reciprocal) < np.inf else 0
         while size > 0:
             size -= 1
             node = waiting[size]
@@ -128,8 +126,8 @@ def _first_hits(
                 continue
             near_node = 2 * node
             far = near_node + 1
-            near_entry = _entry(_row(lows, near_node), _row(highs, near_node), origin, reciprocal)
-            far_entry = _entry(_row(lows, far), _row(highs, far), origin, reciprocal)
+            near_entry = _entry(boxes, near_node, origin, reciprocal)
+            far_entry = _entry(boxes, far, origin, reciprocal)
             if far_entry < near_entry:
                 near_node, far = far, near_node
                 near_entry, far_entry = far_entry, near_entry
@@ -150,7 +148,7 @@ def _row(places: np.ndarray, i: int) -> Vector:
 
 @numba.njit(inline="always", **PLAIN)
 def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
-    """Return a corner of one of triangles (m, 3, 3)."""
+    """Return a corner of one of triangles (m, 3, 3) or boxes (m, 2, 3)."""
     return corners[j, number, 0], corners[j, number, 1], corners[j, number, 2]
 
 
@@ -164,8 +162,10 @@ def _inverse(component: float) -> float:
 
 
 @numba.njit(inline="always", **PLAIN)
-def _entry(low: Vector, high: Vector, origin: Vector, reciprocal: Vector) -> float:
-    """Return where a ray enters a box, at least 0; infinite if it does not."""
+def _entry(boxes: np.ndarray, node: int, origin: Vector, reciprocal: Vector) -> float:
+    """Return where a ray enters a node's box, at least 0; infinite if it does not."""
+    low = _corner(boxes, node, 0)
+    high = _corner(boxes, node, 1)
     entry = 0.0
     leave = np.inf
     for axis in range(3):
@@ -205,13 +205,12 @@ def _met(corners: np.ndarray, j: int, origin: Vector, direction: Vector) -> Vect
 def _closest_places(
     corners: np.ndarray,
     numbers: np.ndarray,
-    lows: np.ndarray,
-    highs: np.ndarray,
+    boxes: np.ndarray,
     points: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     closest = np.full(len(points), -1, np.int64)
     feet = np.zeros((len(points), 3))
-    leaves = len(lows) // 2
+    leaves = len(boxes) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
     for i in range(len(points)):
         point = _row(points, i)
@@ -225,7 +224,7 @@ def _closest_places(
         while size > 0:
             size -= 1
             node = waiting[size]
-            if _square_off(_row(lows, node), _row(highs, node), point) > nearest:
+            if _square_off(_corner(boxes, node, 0), _corner(boxes, node, 1), point) > nearest:
                 continue
             if node >= leaves:
                 begin = (node - leaves) * LEAF
@@ -242,8 +241,10 @@ def _closest_places(
                 continue
             near_node = 2 * node
             far = near_node + 1
-            near_square = _square_off(_row(lows, near_node), _row(highs, near_node), point)
-            far_square = _square_off(_row(lows, far), _row(highs, far), point)
+            near_square = _square_off(
+                _corner(boxes, near_node, 0), _corner(boxes, near_node, 1), point
+            )
+            far_square = _square_off(_corner(boxes, far, 0), _corner(boxes, far, 1), point)
             if far_square < near_square:
                 near_node, far = far, near_node
             waiting[size] = far

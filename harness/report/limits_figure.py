@@ -23,6 +23,8 @@ WIDTH_IN = 4.6
 """Its text is then as large as the page's on a screen of 400 pixels."""
 ROW_IN = 0.36
 """Height of a set-up: its name, and below it its sizes."""
+MOST_LETTERS = 76
+"""Longest name that fits into the width."""
 AXIS_IN = 0.75
 """Height of an axis with its title."""
 
@@ -31,7 +33,7 @@ def limits_figure(limits: Sequence[SetUpLimit]) -> str:
     """Draw a90 with its interval and a90/95 of each set-up, a row each, in the order of ``limits``;
     diameters, depths and lengths in panels of their own."""
     drawn = limits[:MOST_ROWS]
-    names = short_names(limits)
+    names = _drawn_names(short_names(limits))
     panels = {
         kind: [limit for limit in drawn if limit.record.inspected.limit_of == kind]
         for kind in dict.fromkeys(limit.record.inspected.limit_of for limit in drawn)
@@ -46,6 +48,20 @@ def limits_figure(limits: Sequence[SetUpLimit]) -> str:
     height_in = ROW_IN * len(drawn) + AXIS_IN * len(panels)
     alt = " ".join(limit_sentence(limit) for limit in drawn)
     return svg("limits", (WIDTH_IN, height_in), alt, draw)
+
+
+def _drawn_names(names: dict[str, str]) -> dict[str, str]:
+    """Return names without what all of several share, such as the number of frames, and cut to
+    `MOST_LETTERS`."""
+    parts_of = {label: name.split(", ") for label, name in names.items()}
+    shared = set.intersection(*(set(parts) for parts in parts_of.values()))
+    drawn = {}
+    for label, parts in parts_of.items():
+        own = [part for part in parts if part not in shared] or parts
+        name = ", ".join(own)
+        is_long = len(name) > MOST_LETTERS
+        drawn[label] = f"{name[: MOST_LETTERS - 1]}…" if is_long else name
+    return drawn
 
 
 def _draw_panel(axes: Axes, kind: str, limits: Sequence[SetUpLimit], names: dict[str, str]) -> None:

@@ -34,6 +34,7 @@ from harness.tables.limits import (
     short_names,
     study_answer,
 )
+from harness.tables.references import reference_headline
 from harness.tables.unknowns import (
     UNKNOWN_TABLE,
     stated_of,
@@ -63,9 +64,9 @@ def study_parts(result: StudyResult) -> list[str | Grid]:
 
 def _answers(result: StudyResult) -> list[str]:
     """Return the answer at the stated values and, of a study with unknowns, before it the range of
-    the best set-up over them."""
+    the best set-up over them; of one that compares references, what they buy."""
     stated = [limit for limit in result.limits if not limit.record.drawn]
-    headline = unknown_headline(result)
+    headline = unknown_headline(result) or reference_headline(stated)
     answer = study_answer(stated)
     return [headline, answer] if headline else [answer]
 

@@ -27,6 +27,7 @@ from harness.tables.limits import (
 from harness.tables.unknowns import UNKNOWN_TABLE, unknown_rows
 from harness.vocabulary import text
 from harness.vocabulary.path_names import (
+    NAMED,
     camera_title,
     differing,
     names_of,
@@ -330,7 +331,8 @@ def _line_labels(lines: Sequence[AxisLine], names: Mapping[str, str]) -> list[st
             if axis in line.fixed:
                 words = axis_value(axis, differing(line.fixed[axis], values_of[axis]))
                 # a name such as kinect_v2 explains itself, a number needs a key (albedo=0.2)
-                explains_itself = axis == FRAMES or isinstance(line.fixed[axis], str)
+                is_named = axis == FRAMES or names[axis] in NAMED
+                explains_itself = is_named or isinstance(line.fixed[axis], str)
                 parts.append(words if explains_itself else f"{names[axis]}={words}")
         labels.append(", ".join(parts))
     return labels

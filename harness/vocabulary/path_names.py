@@ -139,16 +139,28 @@ def _setting_in_words(part: str) -> str:
 
 
 def differing(value: Any, siblings: Iterable[Any]) -> Any:
-    """Return a mapping without the entries that all ``siblings`` share; return any other value
-    unchanged."""
+    """Return a mapping without the entries that all ``siblings`` share, and with the kind alone of
+    an inner mapping that is of another kind in each; return any other value unchanged."""
     sibling_values = list(siblings)
     if not all(isinstance(item, dict) for item in (value, *sibling_values)):
         return value
-    return {
-        key: part
-        for key, part in value.items()
-        if any(item.get(key) != part for item in sibling_values)
-    }
+    kept = {}
+    for key, part in value.items():
+        parts = [item.get(key) for item in sibling_values]
+        if any(other != part for other in parts):
+            kept[key] = {"kind": part["kind"]} if _differ_in_kind(parts) else part
+    return kept
+
+
+def _differ_in_kind(values: Iterable[Any]) -> bool:
+    """Return whether values are mappings whose kinds all differ, but for equal values."""
+    different: list[Any] = []
+    for value in values:
+        if not isinstance(value, dict) or "kind" not in value:
+            return False
+        if value not in different:
+            different.append(value)
+    return len({value["kind"] for value in different}) == len(different)
 
 
 def _is_number(value: Any) -> bool:

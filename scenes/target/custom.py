@@ -112,6 +112,21 @@ class PanelConfig(Config):
     swage_width_mm: Annotated[float, Field(ge=1.0, le=1e3)] = 12.0
 
 
+class CastingConfig(Config):
+    """A shell like a casting: a round boss in the middle, a rib along y on either side and one
+    along x above, all equally high. Across a rib or the boss z = high / 2 (tanh((s + half) /
+    flank) - tanh((s - half) / flank)), which holds draft and fillets. The default values are
+    guesses: slopes below 20 degrees, so that damage may lie on them, and fillets of 23 mm."""
+
+    kind: Literal["casting"]
+    high_mm: Annotated[float, Field(ge=-50.0, le=50.0)] = 4.0
+    rib_width_mm: Annotated[float, Field(ge=1.0, le=1e3)] = 16.0
+    ribs_x_mm: Annotated[float, Field(ge=0.0, le=5e3)] = 90.0
+    rib_y_mm: Annotated[float, Field(ge=-5e3, le=5e3)] = 60.0
+    boss_width_mm: Annotated[float, Field(ge=1.0, le=1e3)] = 50.0
+    flank_mm: Annotated[float, Field(ge=1.0, le=1e3)] = 6.0
+
+
 class RoughConfig(Config):
     """A face with random roughness, such as concrete, and a flat back. Heights are Gaussian. Their
     power spectrum in two dimensions is (k^2 + k_outer^2)^-(1 + H) with k_outer = 2 pi /
@@ -159,7 +174,13 @@ class MeshConfig(_FileConfig):
 
 
 DrawnShapeConfig = Annotated[
-    FlatConfig | CylinderConfig | SphereConfig | PolynomialConfig | CorrugatedConfig | PanelConfig,
+    FlatConfig
+    | CylinderConfig
+    | SphereConfig
+    | PolynomialConfig
+    | CorrugatedConfig
+    | PanelConfig
+    | CastingConfig,
     Field(discriminator="kind"),
 ]
 
@@ -189,6 +210,7 @@ ShapeConfig = Annotated[
     | PolynomialConfig
     | CorrugatedConfig
     | PanelConfig
+    | CastingConfig
     | RoughConfig
     | MadeConfig
     | MeshConfig,

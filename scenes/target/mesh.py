@@ -25,6 +25,7 @@ from harness.vocabulary.provenance import RESULTS_VERSION
 from harness.vocabulary.seeds import random_stream
 from scenes.target.checks import check_target
 from scenes.target.custom import (
+    CastingConfig,
     DentConfig,
     HoleConfig,
     MaterialConfig,
@@ -187,6 +188,7 @@ def _normalised(values: np.ndarray) -> np.ndarray:
 # of facets on a bent face; under shallow dents depth / 400
 COARSEST_SAGITTA_M = 2e-6
 FINEST_SAGITTA_M = 0.1e-6
+RIBBED_SAGITTA_M = 2e-5  # of a casting: at 0.5 um its flanks and fillets need a million cells
 ROUGH_SAGITTA_M = 8e-5  # the same at the sharpest crest of a rough face; elsewhere a tenth of it
 TAPE_SINK_M = 0.1e-3  # depth of a strip's underside in the board, so that no two surfaces coincide
 # by which corners of a circle's polygon, of the same area, may stand out: 28 corners for 2 mm, 104
@@ -198,6 +200,8 @@ CELL_M = 0.03  # longest edge of a damaged board's triangles
 MOST_ALONG = 64  # and the largest number of these along a side; beyond it, edges are longer
 SPARE_M = 0.2 * MM  # least distance by which a cutter reaches beyond the face
 MAX_CELLS = 1_000_000  # of a bent sheet: some 300 MB
+EVEN_CELLS = 10_000  # up to which a sheet's cells are all alike
+LOOKED_AT = 257  # places along a side at which a face's bend is looked at, for uneven cells
 
 
 @dataclass(frozen=True)
@@ -362,6 +366,8 @@ def _sagitta_m(config: TargetConfig) -> float:
     """Return how far facets may lie off the face."""
     if face_of(config.board).rough:
         return ROUGH_SAGITTA_M
+    if isinstance(config.board.as_drawn.shape, CastingConfig):
+        return RIBBED_SAGITTA_M
     shallowest_m = np.inf
     for bowl in (*config.dents, *config.flaws):
         if bowl.depth_mm is not None:
@@ -385,13 +391,27 @@ def sheet(
     needs more than MAX_CELLS."""
     turn = turned(angle_rad)
 
-    def plan(columns: int, rows: int) -> np.ndarray:
-        x = np.linspace(-0.5, 0.5, columns + 1) * size_m[0]
-        y = np.linspace(-0.5, 0.5, rows + 1) * size_m[1]
-        return np.stack(np.meshgrid(x, y), axis=-1) @ turn.T + centre_m
+    def plan(across: np.ndarray, down: np.ndarray) -> np.ndarray:
+        corners = np.stack(np.meshgrid(across * size_m[0], down * size_m[1]), axis=-1)
+        return corners @ turn.T + centre_m
 
-    columns, rows = _cells(face, plan(64, 64), turn, size_m, sagitta_m)
-    plan_m = plan(columns, rows)
+    looked_at = np.linspace(-0.5, 0.5, 65)
+    bends = _bends(face, plan(looked_at, looked_at), turn)
+    counts = [_cells(bend.max(), size, sagitta_m) for bend, size in zip(bends, size_m, strict=True)]
+    lines = [np.linspace(-0.5, 0.5, count + 1) for count in counts]
+    if np.prod(counts) > EVEN_CELLS and not face.rough:
+        looked_at = np.linspace(-0.5, 0.5, LOOKED_AT)
+        bends = _bends(face, plan(looked_at, looked_at), turn)
+        lines = [_uneven(bend, size, sagitta_m) for bend, size in zip(bends, size_m, strict=True)]
+    columns, rows = (len(line) - 1 for line in lines)
+    if columns * rows > MAX_CELLS:
+        raise UserError(
+            f"board: its face needs {columns} x {rows} cells "
+            f"for an error below {sagitta_m / MM * 1e3:.3g} um",
+            legal=f"at most {MAX_CELLS} cells",
+            fix="make the board smaller or bend it less",
+        )
+    plan_m = plan(*lines)
     points = face.point(plan_m[..., 0], plan_m[..., 1])
     normals = face.normal(plan_m[..., 0], plan_m[..., 1])
     lower = points + bottom_m * normals
@@ -405,44 +425,44 @@ def sheet(
     )
 
 
-def _cells(
-    face: Face,
-    places: np.ndarray,
-    turn: np.ndarray,
-    size_m: tuple[float, float],
-    sagitta_m: float,
-) -> tuple[int, int]:
-    """Return the numbers of columns and rows of a sheet's grid that keep its facets close to the
-    face.
+def _bends(face: Face, places: np.ndarray, turn: np.ndarray) -> list[np.ndarray]:
+    """Return the largest bend of a sheet's face along x at each of its columns (m,), and along y at
+    each of its rows (n,).
 
     Linear interpolation on a right triangle of legs a, b errs by (|f_aa| a^2 + 2 |f_ab| ab +
     |f_bb| b^2) / 8 or less. Legs with a^2 (|f_aa| + |f_ab|) = b^2 (|f_bb| + |f_ab|) = 4 sagitta
-    keep that below the sagitta.
+    keep that below the sagitta: these sums are the bends.
 
-    ``places`` (n, m, 2): where the face's bend is looked at. ``turn`` (2, 2): the sheet's axes in
+    ``places`` (n, m, 2): where the face is looked at. ``turn`` (2, 2): the sheet's axes in
     plan."""
     fxx, fxy, fyy = np.moveaxis(face.bend(places[..., 0], places[..., 1]), -1, 0)
     first_row = np.stack([fxx, fxy], -1)
     second_row = np.stack([fxy, fyy], -1)
     hessian = np.stack([first_row, second_row], -2)
-    along_sheet = np.abs(turn.T @ hessian @ turn)
-    bends = along_sheet.sum(axis=-1).max(axis=(0, 1))
-    counts = []
-    for bend, size in zip(bends, size_m, strict=True):
-        count = 1
-        # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
-        if bend > 1e-9:
-            count = max(1, int(np.ceil(size / np.sqrt(4 * sagitta_m / bend))))
-        counts.append(count)
-    columns, rows = counts
-    if columns * rows > MAX_CELLS:
-        raise UserError(
-            f"board: its face needs {columns} x {rows} cells "
-            f"for an error below {sagitta_m / MM * 1e3:.3g} um",
-            legal=f"at most {MAX_CELLS} cells",
-            fix="make the board smaller or bend it less",
-        )
-    return columns, rows
+    bends = np.abs(turn.T @ hessian @ turn).sum(axis=-1)
+    return [bends[..., 0].max(axis=0), bends[..., 1].max(axis=1)]
+
+
+def _cells(bend: float, size_m: float, sagitta_m: float) -> int:
+    """Return the number of equal cells along a side that keep facets within the sagitta."""
+    # 1e-9 per metre: rounding of a turned straight direction must not cut it into cells.
+    if bend <= 1e-9:
+        return 1
+    return max(1, int(np.ceil(size_m / np.sqrt(4 * sagitta_m / bend))))
+
+
+def _uneven(bends: np.ndarray, size_m: float, sagitta_m: float) -> np.ndarray:
+    """Return the lines of a grid along a side, -1/2 to 1/2 of it, as close as the bend there asks.
+    ``bends`` (n,): the largest at even places of the side."""
+    # between two places the bend may be larger than at either
+    widened = np.pad(bends, 1, mode="edge")
+    largest = np.maximum(np.maximum(widened[:-2], widened[2:]), bends)
+    cells_per_side = size_m * np.sqrt(np.maximum(largest, 1e-9) / (4 * sagitta_m))
+    places = np.linspace(-0.5, 0.5, len(bends))
+    steps = np.maximum(cells_per_side[:-1], cells_per_side[1:]) / (len(bends) - 1)
+    passed = np.concatenate([[0.0], np.cumsum(steps)])
+    count = max(1, int(np.ceil(passed[-1])))
+    return np.interp(np.linspace(0.0, passed[-1], count + 1), passed, places)
 
 
 def solids_of(

@@ -130,6 +130,8 @@ def face_of(board: custom.BoardConfig) -> Face:
         return _corrugated_face(shape)
     if isinstance(shape, custom.PanelConfig):
         return _panel_face(shape)
+    if isinstance(shape, custom.CastingConfig):
+        return _casting_face(shape)
     if isinstance(shape, custom.CylinderConfig | custom.SphereConfig):
         return _round_face(shape)
     if isinstance(shape, custom.PolynomialConfig):
@@ -181,6 +183,67 @@ def _panel_face(shape: custom.PanelConfig) -> Face:
         return height, by_x, by_y, by_xx, by_xy, by_yy
 
     return Face(panel)
+
+
+def _casting_face(shape: custom.CastingConfig) -> Face:
+    """Return an even face with ribs and a boss (`scenes.target.custom`). Where they cross, none
+    stands out above the other: z = high (1 - product of (1 - share of each))."""
+    flank_m = shape.flank_mm * MM
+    high_m = shape.high_mm * MM
+
+    def casting(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        none = np.zeros(x.shape)
+        left = (1.0 + none, none, none, none, none, none)
+        for middle_mm in (-shape.ribs_x_mm, shape.ribs_x_mm):
+            share, slope, bend = _ridge(x - middle_mm * MM, shape.rib_width_mm * MM, flank_m)
+            left = _product(left, (1.0 - share, -slope, none, -bend, none, none))
+        share, slope, bend = _ridge(y - shape.rib_y_mm * MM, shape.rib_width_mm * MM, flank_m)
+        left = _product(left, (1.0 - share, none, -slope, none, none, -bend))
+        # 1 nm keeps the middle of the boss, where its slope is 0, from 0 / 0
+        radius = np.sqrt(x**2 + y**2 + 1e-18)
+        share, slope, bend = _ridge(radius, shape.boss_width_mm * MM, flank_m)
+        across = slope / radius
+        boss = (
+            1.0 - share,
+            -across * x,
+            -across * y,
+            -((bend - across) * (x / radius) ** 2 + across),
+            -(bend - across) * x * y / radius**2,
+            -((bend - across) * (y / radius) ** 2 + across),
+        )
+        left = _product(left, boss)
+        return (high_m * (1.0 - left[0]), *(-high_m * derivative for derivative in left[1:]))
+
+    top_m = float(casting(np.zeros(1), np.zeros(1))[0][0])
+
+    def from_middle(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        height, *derivatives = casting(x, y)
+        return (height - top_m, *derivatives)
+
+    return Face(from_middle)
+
+
+def _ridge(s: np.ndarray, width_m: float, flank_m: float) -> tuple[np.ndarray, ...]:
+    """Return the share of its height that a ridge has at distances ``s`` from its middle, and the
+    first and second derivatives."""
+    rising = np.tanh((s + width_m / 2) / flank_m)
+    falling = np.tanh((s - width_m / 2) / flank_m)
+    share = (rising - falling) / 2
+    slope = (falling**2 - rising**2) / (2 * flank_m)
+    bend = (falling * (1 - falling**2) - rising * (1 - rising**2)) / flank_m**2
+    return share, slope, bend
+
+
+def _product(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Return the product of two functions of x and y with its derivatives, in `ORDERS`."""
+    return (
+        a[0] * b[0],
+        a[1] * b[0] + a[0] * b[1],
+        a[2] * b[0] + a[0] * b[2],
+        a[3] * b[0] + 2 * a[1] * b[1] + a[0] * b[3],
+        a[4] * b[0] + a[1] * b[2] + a[2] * b[1] + a[0] * b[4],
+        a[5] * b[0] + 2 * a[2] * b[2] + a[0] * b[5],
+    )
 
 
 FORM_ORDERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))

@@ -51,6 +51,12 @@ CorrosionConfig.rough_mm [0,100] 0.2
 CorrosionConfig.grain_mm [0.1,200] 3.0
 CorrosionConfig.uneven [0,0.3] 0.12
 CorrosionConfig.seed [0,9223372036854775807] 1
+CastingConfig.high_mm [-50,50] 4.0
+CastingConfig.rib_width_mm [1,1000] 16.0
+CastingConfig.ribs_x_mm [0,5000] 90.0
+CastingConfig.rib_y_mm [-5000,5000] 60.0
+CastingConfig.boss_width_mm [1,1000] 50.0
+CastingConfig.flank_mm [1,1000] 6.0
 CorrugatedConfig.period_mm [5,1000] 76.0
 CorrugatedConfig.depth_mm (0,200] 18.0
 CylinderConfig.radius_mm [10,1000000] required

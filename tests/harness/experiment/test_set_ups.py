@@ -10,7 +10,7 @@ import pytest
 from harness.experiment.load import load_experiment
 from harness.experiment.schema import MAIN, Experiment
 from harness.vocabulary.declaration.yaml_source import DeclarationError
-from harness.vocabulary.path_names import in_words, names_of, unit_of, value_text
+from harness.vocabulary.path_names import differing, in_words, names_of, unit_of, value_text
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -186,6 +186,11 @@ def test_references_and_shapes_read_as_an_engineer_says_them():
     made = {"kind": "made", "shape": {"kind": "panel"}, "form_mm": 0.3, "sizes_percent": 2.0}
     shape = value_text("source.target.board.shape", made)
     assert shape == "made, door panel, form 0.3 mm, sizes 2 %"
+    bent = {"kind": "cylinder", "radius_mm": 70.0}
+    sibling = {**made, "shape": bent}
+    assert differing(sibling, [made, sibling]) == {"shape": {"kind": "cylinder"}}
+    wider = {**made, "shape": {**bent, "radius_mm": 80.0}}
+    assert differing(sibling, [made, sibling, wider]) == {"shape": bent}
     name = "shape=flat board, compared with=5 good parts"
     assert in_words(name) == "flat board, 5 good parts"
     assert in_words("the script as it stands, k = 1.2") == "the script as it stands, k = 1.2"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from harness.evaluation.study.record import StudyRecord, Unflawed
 from harness.evaluation.study.result import StudyResult, evaluate_study
 from harness.records.trials import ResultTables
-from harness.report.limits_figure import _draw_row
+from harness.report.limits_figure import MOST_LETTERS, _draw_row, _drawn_names
 from harness.report.study_page import _best, study_html, study_parts
 from harness.tables.limits import limit_sentence
 from harness.tables.study import DEPTH_LIMITS, depths_at
@@ -425,3 +425,13 @@ def test_given_thresholds_and_no_hole_free_boards() -> None:
 
 def test_the_same_input_gives_the_same_page(single: StudyResult, single_page: str) -> None:
     assert study_html(single, (), PROVENANCE, YAML, "A study") == single_page
+
+
+def test_names_in_the_figure_say_what_differs_and_fit() -> None:
+    labels = ["flat board, no reference, 20 frames", "door panel, no reference, 20 frames"]
+    names = _drawn_names({label: label for label in labels})
+    assert list(names.values()) == ["flat board", "door panel"]
+    (alone,) = _drawn_names({labels[0]: labels[0]}).values()
+    assert alone == labels[0]
+    (long,) = _drawn_names({"a": "x" * 100}).values()
+    assert len(long) == MOST_LETTERS

@@ -18,6 +18,7 @@ from harness.vocabulary.geometry import invert, rotate_vectors, transform_points
 from scenes.target.custom import (
     BackingConfig,
     BoardConfig,
+    CastingConfig,
     CylinderConfig,
     DentConfig,
     FlatConfig,
@@ -454,6 +455,36 @@ def test_facets_stay_close_to_the_face(shape: Any) -> None:
     points = np.einsum("wk,tkc->twc", weights, corners)
     off = points[..., 2] - face_of(built.config.board).height_m(points[..., 0], points[..., 1])
     assert 1e-7 < np.abs(off).max() <= 2e-6
+
+
+def test_ribs_and_a_boss_are_close_to_the_face_with_few_cells() -> None:
+    sizes_mm = {"high_mm": 6.0, "rib_width_mm": 10.0, "boss_width_mm": 40.0, "flank_mm": 3.0}
+    casting = CastingConfig(kind="casting", rib_y_mm=30.0, **sizes_mm)
+    board = BoardConfig(width_mm=300, height_mm=100, thickness_mm=1, shape=casting)
+    config = TargetConfig(board=board)
+    face = face_of(board)
+    # a rib 10 mm wide is .07 of its height lower than the boss, where two cross .07 squared
+    tops_m = face.height_m(np.array([0.0, 0.09, -0.09, 0.09]), np.array([0.0, 0.0, -0.02, 0.03]))
+    short = 1.0 - math.tanh(5 / 3)
+    assert tops_m == pytest.approx(-6e-3 * np.array([0, short, short, short**2]), abs=2e-7)
+    assert face.height_m(0.05, -0.02) == pytest.approx(-6e-3, abs=1e-6)
+    x, y = np.random.default_rng(1).uniform([[-0.14], [-0.045]], [[0.14], [0.045]], (2, 400))
+    step = 1e-6
+    along_x = (face.height_m(x + step, y) - face.height_m(x - step, y)) / (2 * step)
+    along_y = (face.height_m(x, y + step) - face.height_m(x, y - step)) / (2 * step)
+    assert face.slope(x, y) == pytest.approx(np.stack([along_x, along_y], -1), abs=1e-6)
+    bend_x = (face.slope(x + step, y) - face.slope(x - step, y)) / (2 * step)
+    bend_y = (face.slope(x, y + step) - face.slope(x, y - step)) / (2 * step)
+    bend = np.stack([bend_x[..., 0], bend_x[..., 1], bend_y[..., 1]], -1)
+    assert face.bend(x, y) == pytest.approx(bend, abs=1e-3)
+    mesh = board_solid(config, ())
+    front = mesh.triangles[mesh.face_normals[:, 2] > 0.3]
+    weights = np.random.default_rng(2).dirichlet([1.0, 1.0, 1.0], len(front))
+    points = np.einsum("tw,twc->tc", weights, front)
+    off = points[:, 2] - face.height_m(points[:, 0], points[:, 1])
+    assert 1e-5 < np.abs(off).max() <= 2e-5
+    # four triangles are a cell of both sides; cells that are all alike would be some 110,000
+    assert len(mesh.faces) / 4 < 24_000
 
 
 @pytest.mark.parametrize("shape", [FlatConfig(), *CURVED], ids=lambda shape: shape.kind)

@@ -247,7 +247,11 @@ def test_hole_that_leaves_through_the_side_of_a_bulging_board() -> None:
 
 
 def test_a_face_that_needs_too_many_cells() -> None:
-    shape = {"kind": "polynomial", "terms": [{"power_x": 8, "power_y": 8, "coefficient_mm": 150}]}
+    # bent alike everywhere, so that cells of different sizes save none
+    terms = []
+    for power_x, power_y in ((2, 0), (1, 1), (0, 2)):
+        terms.append({"power_x": power_x, "power_y": power_y, "coefficient_mm": 1000})
+    shape = {"kind": "polynomial", "terms": terms}
     config = target_from_data(
         {
             "name": "custom",
@@ -257,6 +261,7 @@ def test_a_face_that_needs_too_many_cells() -> None:
                 "thickness_mm": 12,
                 "shape": shape,
             },
+            "pose": {"distance_m": 8.0},
         }
     ).declare()
     with pytest.raises(UserError, match="cells for an error below 2 um"):
