@@ -4,7 +4,7 @@
 
 Writes one row per camera, unit and quantity: truth, estimate, 95 % interval; prints a table of the
 mean estimate, the mean half width, and how many intervals hold the truth. The same command goes on
-with the cameras that the file does not hold yet. Each unit has another fixed pattern (0.3 mm), other
+with the units that the file does not hold yet. Each unit has another fixed pattern (0.3 mm), other
 noise (1 mm), another pose, and takes 12 frames of 240 x 224 pixels at 0.42 to 0.55 m; light is mixed
 over the area of each pixel."""
 
@@ -12,6 +12,7 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -86,20 +87,17 @@ def quantities(
     }
 
 
-def rows_of(camera: str, units: int) -> list[dict[str, float | str]]:
-    """Return the rows of a camera."""
+def rows_of(camera: str, unit: int) -> list[dict[str, float | str]]:
+    """Return the rows of a unit."""
     wrong = CAMERAS[camera]
-    rows = []
-    for unit in range(units):
-        seed = FIRST_SEED + 100 * list(CAMERAS).index(camera) + unit
-        with tempfile.TemporaryDirectory() as folder:
-            arguments = recorded(
-                Path(folder), pattern_mm=0.3, seed=seed, T_camera_gauge=pose_of(seed), **wrong
-            )
-            reading = read_recording(characterise.main.parser().parse_args(arguments))
-        for quantity in quantities(reading, wrong, seed):
-            rows.append({"camera": camera, "unit": unit, **quantity})
-    return rows
+    seed = FIRST_SEED + 100 * list(CAMERAS).index(camera) + unit
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = recorded(
+            Path(folder), pattern_mm=0.3, seed=seed, T_camera_gauge=pose_of(seed), **wrong
+        )
+        reading = read_recording(characterise.main.parser().parse_args(arguments))
+    values = quantities(reading, wrong, seed)
+    return [{"camera": camera, "unit": unit, **quantity} for quantity in values]
 
 
 def table_of(rows: pd.DataFrame) -> Iterator[str]:
@@ -125,13 +123,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--units", type=int, default=4)
     options = parser.parse_args()
-    rows = pd.DataFrame()
+    rows = pd.DataFrame({"camera": [], "unit": []})
     if options.out.exists():
         rows = pd.read_csv(options.out)
-    for camera in CAMERAS:
-        if len(rows) and camera in set(rows.camera):
+    for camera, unit in product(CAMERAS, range(options.units)):
+        if ((rows.camera == camera) & (rows.unit == unit)).any():
             continue
-        rows = pd.concat([rows, pd.DataFrame(rows_of(camera, options.units))])
+        rows = pd.concat([rows, pd.DataFrame(rows_of(camera, unit))])
         rows.to_csv(options.out, index=False)
     print("\n".join(table_of(rows)))
 
