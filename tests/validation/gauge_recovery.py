@@ -3,7 +3,7 @@
     python tests/validation/gauge_recovery.py --out gauge_recovery.csv [--units N]
 
 Writes one row per camera, unit and quantity: truth, estimate, 95 % interval; prints a table of the
-mean estimate, the mean half width, and how many intervals hold the truth. The same command goes on
+mean error, the mean half width, and how many intervals hold the truth. The same command goes on
 with the units that the file does not hold yet. Each unit has another fixed pattern (0.3 mm), other
 noise (1 mm), another pose, and takes 12 frames of 240 x 224 pixels at 0.42 to 0.55 m; light is mixed
 over the area of each pixel."""
@@ -101,20 +101,20 @@ def rows_of(camera: str, unit: int) -> list[dict[str, float | str]]:
 
 
 def table_of(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table: mean truth -> mean estimate ± mean half width (intervals that
-    hold the truth, of all)."""
+    """Yield the lines of the table: mean error ± mean half width of the intervals, and how many of
+    these hold the truth."""
     names = list(dict.fromkeys(rows.quantity))
-    yield f"| camera | {' | '.join(names)} |"
-    yield "|---" * (len(names) + 1) + "|"
+    yield f"| camera | {' | '.join(names)} | hold |"
+    yield "|---" * (len(names) + 2) + "|"
     for camera, of_camera in rows.groupby("camera", sort=False):
         cells = []
         for name in names:
             units = of_camera[of_camera.quantity == name]
+            error = (units.estimate - units.truth).mean()
             half = (units.high - units.low).mean() / 2
-            held = ((units.low <= units.truth) & (units.truth <= units.high)).sum()
-            text = f"{units.truth.mean():.2f}: {units.estimate.mean():.2f} ± {half:.2f}"
-            cells.append(f"{text} ({held}/{len(units)})")
-        yield f"| {camera} | {' | '.join(cells)} |"
+            cells.append(f"{error:+.2f} ± {half:.2f}")
+        held = (of_camera.low <= of_camera.truth) & (of_camera.truth <= of_camera.high)
+        yield f"| {camera} | {' | '.join(cells)} | {held.sum()}/{len(held)} |"
 
 
 def main() -> None:
