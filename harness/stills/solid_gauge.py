@@ -166,8 +166,8 @@ def corrected(gauge: SolidGauge, path: Path) -> SolidGauge:
 
     The plate's sides scale all places in x and y; a sphere's top and diameter place its centre.
     The common uncertainty of scale becomes that of the plate's sides if both are measured, and
-    that of places the largest of the elements' sizes if all are. Raises UserError for a malformed
-    row."""
+    that of places the largest of a step's height and a sphere's centre (top and half of the
+    diameter) if all elements are. Raises UserError for a malformed row."""
     measured = _measured(gauge, path)
     sizes = calliper_sizes(gauge)
 
@@ -212,7 +212,12 @@ def _uncertainty(
     scale = gauge.uncertainty.scale
     of_elements = [key for key in calliper_sizes(gauge) if key[0] != "plate"]
     if all(key in measured for key in of_elements):
-        place_mm = max(measured[key][1] for key in of_elements)
+        of_steps_mm = [measured[step.name, "height"][1] for step in gauge.steps]
+        of_spheres_mm = [
+            float(np.hypot(measured[name, "top above face"][1], measured[name, "diameter"][1] / 2))
+            for name in (ball.name for ball in gauge.spheres)
+        ]
+        place_mm = max(*of_steps_mm, *of_spheres_mm)
     sides = [("plate", "width"), ("plate", "height")]
     if all(side in measured for side in sides):
         scale = max(measured[side][1] / measured[side][0] for side in sides)

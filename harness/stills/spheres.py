@@ -55,6 +55,13 @@ MOST_CANDIDATES = 300
 LEAST_EVIDENCE = 20.0
 """Least logarithm of the likelihood of a sphere over that of a plane, which has as many free
 numbers; among the 3e5 places of an image, noise alone reaches 13."""
+LEAST_EVIDENCE_ALONE = 11.0
+"""The same for something of a sphere's width that stands alone: of such, a view has some thirty at
+most, 1e-4 of its places, whose logarithm is -9."""
+AROUND = 1.6
+"""Radius, in those of the sphere, of the ring that is empty around what stands alone."""
+MOST_AROUND = 0.3
+"""Most points there at the sphere's distance, over those of a surface that goes on."""
 MOST_SPHERES = 12
 LOOSEST = 0.13
 """Largest relative error of a free radius: pieces of edges and noise do not determine one."""
@@ -137,9 +144,12 @@ class SphereFit:
 
     @property
     def size_interval_m(self) -> Interval:
-        """Two-sided 95 % interval of the error of size."""
-        half_m = 2 * self.radius_sigma_m * student(len(self.pixels) - 4)
-        return Interval(self.size_error_m - half_m, self.size_error_m + half_m)
+        """Two-sided 95 % interval of the error of size. Ranges show a sphere's curvature, one over
+        its radius, in which the interval is symmetric."""
+        half = student(len(self.pixels) - 4) * self.radius_sigma_m / self.radius_m
+        smallest_m = self.radius_m / (1 + half)
+        largest_m = self.radius_m / max(1 - half, 1e-3)
+        return Interval(2 * (smallest_m - self.stated_m), 2 * (largest_m - self.stated_m))
 
     def form_error_m(self, share: float) -> float:
         """Return the width of the shell that holds a share of the points: probing error of form
@@ -235,11 +245,13 @@ def fit_sphere(
         if np.linalg.norm(step_m) < 1e-6 * radius_m:
             break
     problem = _problem(image, pixels, present, used)
-    if not problem:
-        rays_present = rays[present]
-        problem = _not_a_sphere(rays_present, ranges_m[present], off_m, radius_m)
     if problem:
         return NoFit(problem)
+    evidence = _evidence(rays[present], ranges_m[present], off_m, radius_m)
+    if evidence < LEAST_EVIDENCE:
+        fill = len(present) / len(pixels)
+        if evidence < LEAST_EVIDENCE_ALONE or not _alone(image, centre_m, radius_m, fill):
+            return NoFit("its points lie on a plane as well as on a sphere")
     return _finished(image, pixels, used, centre_m, radius_m)
 
 
@@ -269,11 +281,9 @@ def _problem(
     return ""
 
 
-def _not_a_sphere(
-    rays: np.ndarray, ranges_m: np.ndarray, off_m: np.ndarray, radius_m: float
-) -> str:
-    """Return "" if the points (n,) of a disc speak for a sphere, from which they are ``off_m``
-    (n,), and against a plane; else why not. Residuals count up to the same limit for both."""
+def _evidence(rays: np.ndarray, ranges_m: np.ndarray, off_m: np.ndarray, radius_m: float) -> float:
+    """Return the logarithm of the likelihood of a sphere, from which the points (n,) of a disc are
+    ``off_m`` (n,), over that of a plane. Residuals count up to the same limit for both."""
     beside = (ranges_m > 0) & (np.abs(off_m) <= radius_m)
     basis = rays[beside]
     # a plane is linear in rays over the range: 1 = range (rays . n), so n solves rays . n = 1/range
@@ -283,8 +293,21 @@ def _not_a_sphere(
     limit_m2 = (WIDEST * radius_m) ** 2
     of_sphere_m2 = np.minimum(off_m[beside] ** 2, limit_m2).sum()
     of_plane_m2 = np.minimum(from_plane_m**2, limit_m2).sum()
-    evidence = len(basis) / 2 * float(np.log(of_plane_m2 / max(of_sphere_m2, 1e-18)))
-    return "" if evidence >= LEAST_EVIDENCE else "its points lie on a plane as well as on a sphere"
+    return len(basis) / 2 * float(np.log(of_plane_m2 / max(of_sphere_m2, 1e-18)))
+
+
+def _alone(image: RangeImage, centre_m: np.ndarray, radius_m: float, fill: float) -> bool:
+    """Return whether hardly any points lie around a sphere at its distance, of those that a surface
+    would have there that is ``fill``ed as the sphere is."""
+    away_m = float(np.linalg.norm(centre_m))
+    silhouette_rad = np.arcsin(min(radius_m / away_m, 1.0))
+    with np.errstate(invalid="ignore"):
+        off_rad = np.arccos(np.clip(image.rays @ (centre_m / away_m), -1, 1))
+        around = (off_rad > silhouette_rad + RIMS_PX[0] * image.pitch_rad) & (
+            off_rad < AROUND * silhouette_rad + RIMS_PX[0] * image.pitch_rad
+        )
+        at_its_distance = around & (np.abs(image.range_m - away_m) < 1.5 * radius_m)
+    return bool(at_its_distance.sum() < MOST_AROUND * fill * around.sum())
 
 
 def _step(jacobian: np.ndarray, off_m: np.ndarray, cosine: np.ndarray) -> np.ndarray:

@@ -19,12 +19,14 @@ def sphere_scene(
     missing: float = 0.0,
     seed: int = 0,
     blur_px: float = 0.0,
+    lens: Lens = LENS,
+    wall_m: float = WALL_M,
 ) -> RangeImage:
     """Spheres whose noise grows with the inverse of the cosine of incidence, is correlated over
     ``blur_px``, and loses a share of all pixels."""
     rng = np.random.default_rng(seed)
-    slopes = LENS.region_slopes(LENS.whole)
-    plane = range_image(np.full((*slopes.shape[:2], 3), WALL_M), slopes)
+    slopes = lens.region_slopes(lens.whole)
+    plane = range_image(np.full((*slopes.shape[:2], 3), wall_m), slopes)
     rays = plane.rays
     range_m = plane.range_m
     with np.errstate(divide="ignore"):

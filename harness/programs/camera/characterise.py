@@ -177,6 +177,11 @@ def main(options: argparse.Namespace, command: str) -> int:
     answer = f"Temporal noise of single pixels: {noise}." if noise else "No flat surface was found."
     warnings = [warning for recording in recordings for warning in recording.warnings]
     warnings += measured.doubts
+    if by_gauge and options.like:
+        warnings.append(
+            f"{CAMERA_FILE} has no scale, bias and blur by the gauge: only an empirical camera has "
+            "(leave out --like)"
+        )
     repeated = []
     for figure in ("fill rate", "temporal noise"):
         off = [abs(row.ratio - 1) for row in rows if row.figure == figure]

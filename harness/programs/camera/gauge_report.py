@@ -133,11 +133,21 @@ class GaugeReading:
         return text
 
     def stated(self) -> list[Stated]:
-        """Return what the gauge says for an empirical camera's file."""
-        low, high = (end / MM for end in (self.fit.interval(1).low, self.fit.interval(1).high))
-        bias_mm = self.fit.bias_m / MM
-        source = f"the gauge shows a bias of {bias_mm:+.2f} mm ({low:+.2f} to {high:+.2f} mm)"
-        facts = [Stated("unit", "offset_mm", abs(bias_mm), source)]
+        """Return what the gauge says for an empirical camera's file. The offset between units
+        becomes the standard error of this unit's range at the gauge."""
+        fit = self.fit
+        away_m = float(np.linalg.norm(fit.T_camera_gauge[:3, 3]))
+        by_both = np.array([away_m, 1.0])
+        error_mm = float(np.sqrt(by_both @ fit.covariance @ by_both)) / MM
+        scale = fit.interval(0)
+        bias = in_mm(fit.bias_m, fit.interval(1))
+        of_scale = f"gauge at {away_m:.2f} m, 95 %: {scale.low:.4f} to {scale.high:.4f}"
+        of_bias = f"gauge at {away_m:.2f} m, 95 %: {bias.low:.2f} to {bias.high:.2f} mm"
+        facts = [
+            Stated("range_error", "scale", fit.scale, of_scale),
+            Stated("range_error", "bias_mm", bias.value, of_bias),
+            Stated("unit", "offset_mm", error_mm, "standard error of range at the gauge"),
+        ]
         if self.blur is not None:
             source = f"{self.blur.pixels} pixels at edges of the gauge"
             facts.append(Stated("edge", "blur_px", self.blur.blur_px, source))

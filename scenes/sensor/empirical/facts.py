@@ -88,6 +88,16 @@ class EdgeKernelFacts(Config):
     """Smallest step that loses returns."""
 
 
+class RangeErrorFacts(Config):
+    """Error of range that all frames of the measured unit share, along each ray: measured = scale
+    * true + bias."""
+
+    scale: Annotated[Fact[float], checked("from 0.5 to 2", lambda value: 0.5 <= value <= 2)]
+    """Measured over true change of range."""
+    bias_mm: Annotated[Fact[float], checked("up to 1000 mm", lambda value: abs(value) <= 1000)]
+    """Measured range minus scale times true range."""
+
+
 class EmpiricalCamera(CameraFacts):
     """Any depth camera, described by the statistics of its captures."""
 
@@ -105,6 +115,9 @@ class EmpiricalCamera(CameraFacts):
     """Losses at steps of depth."""
     engine: LimitFacts
     """Limits and step of the output."""
+    range_error: RangeErrorFacts | None = None
+    """Scale and bias of the unit, which a gauge shows; none without it. A part of the effect "unit
+    offset"."""
 
     @model_validator(mode="after")
     def _possible(self) -> EmpiricalCamera:

@@ -87,7 +87,11 @@ class EmpiricalImager(UnitModel[EmpiricalCamera]):
             dropped = np.interp(level, np.log(dropouts.amplitude.value), dropouts.share.value)
         # a return is lost by noise, or at a step
         chance = np.where(lit, 1 - (1 - dropped) * (1 - self._gap(range_m)), 1.0)
-        shown_m = self._blurred(range_m) + self.static_error_m
+        shown_m = self._blurred(range_m)
+        known = self.camera.range_error
+        if known is not None and self.config.effects.unit_offset:
+            shown_m = known.scale.value * shown_m + known.bias_mm.value * MM
+        shown_m = shown_m + self.static_error_m
         return IdealRange(
             range_m=shown_m.astype(f4),
             sigma_m=sigma_m.astype(f4),

@@ -16,6 +16,7 @@ from harness.stills.spheres import (
     find_spheres,
     fit_sphere,
 )
+from harness.vocabulary.geometry import Lens
 from tests.support.spheres import LENS, sphere_scene
 
 RADIUS_M = 0.0725
@@ -59,6 +60,43 @@ def test_half_of_the_pixels_and_much_noise_leave_the_spheres():
     for fit, centre_m in zip(fits, CENTRES_M, strict=True):
         assert np.linalg.norm(fit.centre_m - centre_m) < 5e-3
         assert 0.4 < fit.seen_share < 0.6
+
+
+FAR = Lens(width=120, height=90, fx=500.0, fy=500.0, cx=59.5, cy=44.5)
+
+
+def test_a_far_sphere_in_the_sun_is_measured_with_a_wide_interval():
+    """145 mm at 3.5 m, noise of 10 mm, half of the pixels lost: 36 of 40 are found and 34 of 36
+    intervals hold; here, eight."""
+    centre_m = np.array([[0.05, 0.02, 3.5]])
+    held = 0
+    found = 0
+    for seed in range(8):
+        image = sphere_scene(centre_m, RADIUS_M, 10e-3, 0.5, seed, lens=FAR, wall_m=5.0)
+        for fit in find_spheres(image, RADIUS_M):
+            found += 1
+            ends = fit.size_interval_m
+            assert 0.02 < ends.high - ends.low < 0.09
+            held += ends.low < 0 < ends.high
+            # ranges show curvature
+            inverse = [1 / (2 * RADIUS_M + end_m) for end_m in (ends.low, ends.high)]
+            assert np.mean(inverse) == pytest.approx(1 / (2 * fit.radius_m))
+    assert found >= 6
+    assert held >= found - 1
+
+
+def test_a_round_plate_that_stands_alone_is_no_sphere():
+    plate_m = sphere_scene(CENTRES_M[:0], RADIUS_M, lens=FAR, wall_m=5.0)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        normal = np.array([*rng.uniform(-0.6, 0.6, 2), -1.0])
+        centre_m = np.array([0.05, 0.02, 3.5])
+        met_m = (normal @ centre_m) / (plate_m.rays @ normal)
+        away_m = np.linalg.norm(plate_m.rays * met_m[..., None] - centre_m, axis=-1)
+        range_m = np.where(away_m < RADIUS_M, met_m, plate_m.range_m)
+        range_m += 10e-3 * rng.standard_normal(range_m.shape)
+        range_m[rng.random(range_m.shape) < 0.5] = np.nan
+        assert find_spheres(RangeImage(range_m, plate_m.rays), RADIUS_M) == []
 
 
 @pytest.mark.parametrize("sigma_m", [1e-3, 20e-3])

@@ -56,7 +56,9 @@ def test_one_recording_gives_all_files(tmp_path: Path, capsys):
     assert "mm in bias" in capsys.readouterr().out
     out = tmp_path / "out"
     camera = read_camera(out / "my_camera.yaml")
-    assert camera.unit.offset_mm.value == pytest.approx(5, abs=1.5)
+    assert camera.range_error.bias_mm.value == pytest.approx(5, abs=1.5)
+    assert camera.range_error.scale.value == pytest.approx(1, abs=0.003)
+    assert 0 < camera.unit.offset_mm.value < 0.2
     assert camera.edge.blur_px.value == pytest.approx(0.6, abs=0.05)
     pairs = pd.read_csv(out / "spacings.csv")
     assert len(pairs) == 15

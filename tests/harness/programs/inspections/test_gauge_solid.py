@@ -112,6 +112,21 @@ def test_a_calliper_corrects_the_truth(tmp_path: Path):
     assert corrected(plain, filled(tmp_path / "empty.csv", {})) == plain
 
 
+def test_a_calliper_states_the_uncertainty_of_places(tmp_path: Path):
+    """A sphere's centre is as uncertain as its top and half of its diameter together."""
+    plain = designed(is_cut=False)
+    rows = {f"{step.name},height": f"{step.height_mm:g},0.02" for step in plain.steps}
+    for ball in plain.spheres:
+        rows[f"{ball.name},diameter"] = f"{ball.diameter_mm:g},0.06"
+        rows[f"{ball.name},top above face"] = f"{ball.z_mm + 15:g},0.04"
+    better = corrected(plain, filled(tmp_path / "calliper.csv", rows))
+    assert better.uncertainty.place_mm == pytest.approx(0.05)
+    assert better.uncertainty.scale == plain.uncertainty.scale
+    rows["step 16,height"] = "16.1,0.2"
+    better = corrected(plain, filled(tmp_path / "calliper.csv", rows))
+    assert better.uncertainty.place_mm == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [

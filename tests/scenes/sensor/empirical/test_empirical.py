@@ -121,6 +121,17 @@ def test_dropouts_by_the_logarithm_of_amplitude(albedo, share):
     assert quiet.expose(view).chance.max() == 0
 
 
+def test_scale_and_bias_of_the_unit_act_along_each_ray():
+    data = camera_with(unit__offset_mm=0.0).to_data()
+    data["range_error"] = {"scale": fact(1.01), "bias_mm": fact(-5.0)}
+    camera = EmpiricalCamera.from_data(data)
+    view = plane_view(camera, REGION, 2.0, 0.5)
+    without = EmpiricalImager(camera, QUIET, REGION, view.slopes).expose(view).range_m
+    offset = CameraConfig(effects=NO_EFFECTS.model_copy(update={"unit_offset": True}))
+    ideal = EmpiricalImager(camera, offset, REGION, view.slopes).expose(view)
+    assert ideal.range_m == pytest.approx(1.01 * without - 0.005, abs=1e-6)
+
+
 def test_frames_scatter_by_the_noise_and_their_displacement():
     imager, view = imager_before(1.0, 0.5, dropouts__share=[0.0, 0.0])
     ideal = imager.expose(view)
