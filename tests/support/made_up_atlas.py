@@ -134,6 +134,7 @@ def shard(camera: str, seed: int = 1) -> CameraLimits:
         warning="",
         about=about,
         problems=(),
+        failed=(),
         noise=noise,
         kinds=limits_of(tables, noise),
     )

@@ -79,8 +79,8 @@ def main(options: argparse.Namespace, command: str) -> int:
                     f"{_named(planned.names)}: {many(len(planned.parts), 'distance')}", flush=True
                 )
                 shard = planned.made(options.out, engine, command)
-                for problem in shard.problems:
-                    print(f"  {problem}")
+                for line in _summary(shard):
+                    print(f"  {line}", flush=True)
                 stored[shard.camera] = shard
                 write_atlas(atlas_file, list(stored.values()))
     except KeyboardInterrupt:
@@ -107,6 +107,20 @@ def _list(to_make: list[Planned], out: Path) -> None:
         print(f"{_named(planned.names)}: {_in_words(work)}", flush=True)
     cost = expected(out, EXPERIMENT, total.renders, total.trials)
     print(f"in all: {_in_words(total)}{f'; {cost}' if cost else ''}")
+
+
+def _summary(shard: CameraLimits) -> list[str]:
+    """Return what could not be computed of a camera, and how well its laws hold."""
+    lines = list(shard.problems)
+    for kind, limits in shard.kinds.items():
+        hits = sum(set_up.hits for set_up in limits.set_ups)
+        sites = sum(set_up.sites for set_up in limits.set_ups)
+        error = limits.law.error
+        holds = "too few tell how well its law holds"
+        if error == error:
+            holds = f"signals at distances left out depart by {100 * error:.0f} %"
+        lines.append(f"{kind}: {hits} of {sites} found; {holds}")
+    return lines
 
 
 def _named(names: tuple[str, ...]) -> str:

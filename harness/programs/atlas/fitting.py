@@ -111,7 +111,7 @@ def fitted(sites: Sites, ranges: Mapping[str, tuple[float, float]]) -> tuple[Law
     error = np.nan
     if len(telling) >= LEAST_TELLING:
         excess = [one.log_signal**2 - one.deviation**2 for one in telling]
-        error = float(np.sqrt(max(np.mean(excess), 0.0)))
+        error = max(float(np.mean(excess)), 0.0) ** 0.5
     values = _most_likely(sites, ends)
     law = Law(
         coefficients=values[:-1],

@@ -50,6 +50,26 @@ class Conditions:
 
 
 @dataclass(frozen=True)
+class FailedSetUp:
+    """A set-up in which no damage could be judged, as the camera saw too little of the board."""
+
+    distance_m: float
+    """Distance of the boards."""
+    albedo: float
+    """Of the boards."""
+    frames: int
+    """Number of averaged frames."""
+
+    def is_no_harder(self, conditions: Conditions) -> bool:
+        """Return whether it is not farther, not darker and of as many frames as conditions."""
+        return (
+            self.distance_m <= conditions.distance_m * (1 + TOLERANCE)
+            and self.albedo >= conditions.albedo * (1 - TOLERANCE)
+            and self.frames >= conditions.frames
+        )
+
+
+@dataclass(frozen=True)
 class PlaneNoise:
     """Depth noise of a camera's pixels before an even plane, over distance and albedo."""
 
@@ -207,6 +227,8 @@ class LimitSurface:
     """The camera's noise."""
     law: Law
     """The law of its signals."""
+    failed: tuple[FailedSetUp, ...]
+    """Set-ups in which nothing could be judged."""
     sites: int
     """Number of damages that were inspected."""
     hits: int
@@ -220,6 +242,12 @@ class LimitSurface:
     def at(self, conditions: Conditions) -> Answer:
         """Return the limit at conditions. Raises Outside beyond the computed range."""
         self._check_inside(conditions)
+        for failed in self.failed:
+            if failed.is_no_harder(conditions):
+                raise Outside(
+                    f"at {failed.distance_m:g} m, albedo {failed.albedo:g}, frames"
+                    f" {failed.frames}, which is no harder, the camera saw too little of boards"
+                )
         noise_mm, fixed_share = self.noise.at(conditions)
         depth_mm = conditions.depth_mm
         if self.kind == "through":

@@ -15,7 +15,7 @@ from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.schema import Experiment
 from harness.programs.atlas.age import sources_digest
 from harness.programs.atlas.fitting import Sites, fitted
-from harness.programs.atlas.limits import PlaneNoise
+from harness.programs.atlas.limits import FailedSetUp, PlaneNoise
 from harness.programs.atlas.parts import DEPTHS_MM, EXPERIMENT, Part
 from harness.programs.atlas.shards import measured_noise, parts_of, sites_of
 from harness.programs.atlas.stored import CameraLimits, KindLimits, SetUp
@@ -30,6 +30,7 @@ from harness.runs.run import run_plan
 from harness.runs.shards import locked
 from harness.runs.tables import tables_of
 from harness.vocabulary.code_digests import Digests
+from harness.vocabulary.errors import DiskFull, UserError
 from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from harness.vocabulary.seeds import digest
@@ -102,10 +103,19 @@ class Planned:
         tables: list[tuple[Part, pd.DataFrame]] = []
         if not self.parts:
             problems.append("gives no depth of any board between the ends of its range")
+        failed: list[FailedSetUp] = []
         for part, experiment in zip(self.parts, self.experiments, strict=True):
-            holes, why = judged(experiment, out, engine, origin)
+            try:
+                holes, why = judged(experiment, out, engine, origin)
+            except DiskFull:
+                raise
+            except UserError as error:
+                holes, why = None, error.message
             if holes is not None:
                 tables.append((part, holes))
+            for frames in part.frames:
+                if holes is None or frames not in set(holes["frames"]):
+                    failed.append(FailedSetUp(part.distance_m, part.albedo, frames))
             if why:
                 problems.append(f"at {part.distance_m:g} m, albedo {part.albedo:g}: {why}")
         config = load_experiment(Path(EXPERIMENT)).config
@@ -118,11 +128,6 @@ class Planned:
             "focal_px": float(load_camera(self.camera).nominal_lens.fx),
             "thickness_mm": float(config.source.to_data()["target"]["board"]["thickness_mm"]),
         }
-        return self._shard(about, problems, limits_of(tables, self.noise))
-
-    def _shard(
-        self, about: Mapping[str, Any], problems: Sequence[str], kinds: Mapping[str, KindLimits]
-    ) -> CameraLimits:
         names = {name: Path(name).stem for name in self.names}
         return CameraLimits(
             camera=names[self.camera],
@@ -130,8 +135,9 @@ class Planned:
             warning=guessed_precision(load_camera(self.camera)),
             about=about,
             problems=tuple(problems),
+            failed=tuple(failed),
             noise=self.noise,
-            kinds=kinds,
+            kinds=limits_of(tables, self.noise),
         )
 
 
@@ -188,8 +194,8 @@ def limits_of(
     typical = float(np.median(np.concatenate(thresholds))) if thresholds else 1.0
     kinds = {}
     for kind in DEPTHS_MM:
-        sites = []
-        used = []
+        sites: list[Sites] = []
+        used: list[Part] = []
         for part, holes in tables:
             own = holes[holes["kind"] == kind]
             if not own.empty:

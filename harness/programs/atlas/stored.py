@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from harness.programs.atlas.law import TERMS, Law
-from harness.programs.atlas.limits import AXES, LimitSurface, PlaneNoise
+from harness.programs.atlas.limits import AXES, FailedSetUp, LimitSurface, PlaneNoise
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json, write_text
 
@@ -85,6 +85,8 @@ class CameraLimits:
     """What it was computed with: commit, versions, digests, detector, boards."""
     problems: tuple[str, ...]
     """What could not be computed, and why."""
+    failed: tuple[FailedSetUp, ...]
+    """Set-ups in which nothing could be judged."""
     noise: PlaneNoise
     """The camera's noise."""
     kinds: Mapping[str, KindLimits]
@@ -104,6 +106,7 @@ class CameraLimits:
             focal_px=float(self.about["focal_px"]),
             noise=self.noise,
             law=self.kinds[kind].law,
+            failed=self.failed,
             sites=sum(set_up.sites for set_up in self.kinds[kind].set_ups),
             hits=sum(set_up.hits for set_up in self.kinds[kind].set_ups),
         )
@@ -116,6 +119,7 @@ class CameraLimits:
             "warning": self.warning,
             "about": dict(self.about),
             "problems": list(self.problems),
+            "failed": [list(vars(set_up).values()) for set_up in self.failed],
             "noise": {
                 "distance_m": list(self.noise.distance_m),
                 "albedo": list(self.noise.albedo),
@@ -197,6 +201,7 @@ def shard_of(camera: str, data: Mapping[str, Any]) -> CameraLimits:
         warning=str(data["warning"]),
         about=about,
         problems=tuple(str(problem) for problem in data["problems"]),
+        failed=tuple(_failed_of(values) for values in data["failed"]),
         noise=PlaneNoise(
             distance_m=distances_m,
             albedo=albedos,
@@ -204,6 +209,16 @@ def shard_of(camera: str, data: Mapping[str, Any]) -> CameraLimits:
             fixed_mm=_not_negative("noise", noise["fixed_mm"], shape),
         ),
         kinds=kinds,
+    )
+
+
+def _failed_of(values: Sequence[Any]) -> FailedSetUp:
+    """Return a set-up that failed. Raises ValueError for odd values."""
+    distance_m, albedo, frames = values
+    return FailedSetUp(
+        distance_m=_above_0("failed", distance_m),
+        albedo=_above_0("failed", albedo),
+        frames=int(_above_0("failed", frames)),
     )
 
 

@@ -12,7 +12,13 @@ from scipy import special
 
 from harness.programs.atlas import fitting
 from harness.programs.atlas.fitting import Sites, fitted
-from harness.programs.atlas.limits import Answer, Conditions, LimitSurface, Outside
+from harness.programs.atlas.limits import (
+    Answer,
+    Conditions,
+    FailedSetUp,
+    LimitSurface,
+    Outside,
+)
 from tests.support.made_up_atlas import (
     BETWEEN_SET_UPS,
     SCATTER,
@@ -97,6 +103,20 @@ def test_neither_is_the_noise_over_the_depth():
     ranges = {**whole.law.ranges, "x": (lowest, highest - 2.0)}
     with pytest.raises(Outside, match="of the depth: the atlas has"):
         replace(whole, law=replace(whole.law, ranges=ranges)).at(Conditions(2.6, 0.1, 1, 1.0))
+
+
+def test_beyond_a_set_up_that_failed_nothing_is_known():
+    """Farther, darker or with fewer frames than boards that the camera did not see."""
+    whole = replace(surface(), failed=(FailedSetUp(1.5, 0.4, 5),))
+    for hard in (Conditions(1.5, 0.4, 5, 20.0), Conditions(2.0, 0.2, 1, 20.0)):
+        with pytest.raises(Outside, match=r"at 1\.5 m, albedo 0\.4, frames 5, which is no harder"):
+            whole.at(hard)
+    for easier in (
+        Conditions(1.4, 0.4, 5, 20.0),
+        Conditions(1.5, 0.5, 5, 20.0),
+        Conditions(1.5, 0.4, 6, 20.0),
+    ):
+        assert len(whole.at(easier).sizes_mm)
 
 
 def test_a_law_of_unknown_error_answers_nothing():

@@ -102,6 +102,7 @@ def test_a_shard_is_made_once_and_again_only_after_a_stop(
     assert "at 3 m, albedo 0.1: the camera sees nothing" in capsys.readouterr().out
     shard = {limits.camera: limits for limits in read_atlas(atlas)}["kinect_v2"]
     assert len(shard.problems) == 1 and list(shard.kinds) == ["through", "blind", "dent", "slot"]
+    assert [set_up.frames for set_up in shard.failed] == [1, 50]
     law = shard.kinds["blind"].law
     assert law.ranges["distance_m"] == (0.525, 2.12) and law.ranges["depth_mm"] == (1, 10)
     assert len(shard.kinds["blind"].set_ups) == 10
