@@ -48,7 +48,9 @@ def parts_of(name: str, noise: PlaneNoise) -> list[Part]:
     parts = []
     for number, share in enumerate(np.linspace(0, 1, PARTS)):
         distance_m = between(float(distances_m[0]), float(distances_m[-1]), share)
-        wanted = (DARK, BRIGHT) if number % 2 else (BRIGHT, DARK)
+        wanted = (BRIGHT, MIDDLE_ALBEDO, DARK)
+        if number % 2:
+            wanted = (DARK, MIDDLE_ALBEDO, BRIGHT)
         albedo = _first_visible(noise, distance_m, wanted)
         if albedo is not None:
             part = Part(

@@ -53,7 +53,7 @@ def test_where_the_camera_gives_no_depth_nothing_is_computed():
     frame_mm[-1, 0] = np.nan  # too dark far away
     frame_mm[0, 3] = np.nan  # too bright near by
     parts = parts_of("kinect_v2", noise(frame_mm))
-    assert [part.albedo for part in parts] == [0.1, 0.1, 0.1, 0.9, 0.9, 0.9]
+    assert [part.albedo for part in parts] == [0.3, 0.1, 0.3, 0.3, 0.9, 0.3]
     frame_mm[0] = np.nan  # nothing near by: the next distance is the nearest
     parts = parts_of("kinect_v2", noise(frame_mm))
     assert (parts[0].distance_m, parts[-1].distance_m) == (0.95, 3.0)
