@@ -121,7 +121,12 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     warnings = _warnings(used.values())
     answer = _headline(kind, asked, rows, size_mm)
-    notes = [*_next_best(rows, size_mm), _basis(rows), *_assumed(kind, rows, used.values())]
+    notes = [
+        *_next_best(rows, size_mm),
+        *_deep_enough(rows),
+        _basis(rows),
+        *_assumed(kind, rows, used.values()),
+    ]
     if not options.camera:
         notes += _same(used.values())
     if called == "gouge":
@@ -336,6 +341,24 @@ def _next_best(rows: Sequence[Row], size_mm: float) -> list[str]:
     return [
         f"Next: {second.surface.title}, {_interval(second)} with {frames}; by their intervals, the"
         f" order of the two {order_is}."
+    ]
+
+
+def _deep_enough(rows: Sequence[Row]) -> list[str]:
+    """Say, where damage of this depth is found at no size, how deep it has to be; nothing where
+    there is a limit, or where none is found at any depth."""
+    from harness.programs.atlas.tables import deep_enough_mm
+    from harness.vocabulary.text import many
+
+    if any(row.answer.rank_mm < math.inf for row in rows):
+        return []
+    depths_mm = [(deep_enough_mm(row), row) for row in rows]
+    depth_mm, row = min(depths_mm, key=lambda pair: pair[0])
+    if depth_mm == math.inf:
+        return []
+    return [
+        f"Found at some size inspected from a depth of about {depth_mm:.2g} mm on:"
+        f" {row.surface.title}, {many(row.conditions.frames, 'frame')}."
     ]
 
 

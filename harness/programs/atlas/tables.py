@@ -11,6 +11,8 @@ from harness.records.schema import Column, Estimate, Table
 
 DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent", "slot": "crack or slot"}
 """Names of kinds of damage in words."""
+DEPTHS = 33
+"""Number of depths at which damage that is deep enough is looked for."""
 BEYOND = 1.001
 """Value of a limit that lies above all sizes inspected, over the largest."""
 DISTANCES = 13
@@ -129,6 +131,17 @@ def order(row: Row) -> tuple[float, float, str]:
     """Return what sorts rows: by the limit, and by its lower end where it lies above the sizes
     inspected."""
     return row.answer.rank_mm, row.answer.low_mm, row.surface.title
+
+
+def deep_enough_mm(row: Row) -> float:
+    """Return the least depth of the atlas, from that of the question on, at which damage of some
+    size is found nine times out of ten; infinite if there is none."""
+    _, deepest_mm = row.surface.ranges["depth_mm"]
+    for depth_mm in np.geomspace(row.conditions.depth_mm, deepest_mm, DEPTHS):
+        deeper, _ = rows_at([row.surface], replace(row.conditions, depth_mm=float(depth_mm)))
+        if deeper and deeper[0].answer.rank_mm < np.inf:
+            return float(depth_mm)
+    return np.inf
 
 
 def curves(surfaces: Sequence[LimitSurface], asked: Sequence[Conditions]) -> list[Row]:

@@ -59,6 +59,15 @@ def test_without_a_size_the_smallest_found_is_the_answer(
     assert "The same numbers: Twin Two as Sharp One, short mode." in output
 
 
+def test_where_no_size_is_found_the_depth_that_is(atlas: Path, capsys: pytest.CaptureFixture[str]):
+    question = "--damage dent --depth 0.5mm --distance 2m --frames 1 --camera sharp"
+    output = said(question, atlas, capsys)
+    assert output.startswith("At 2 m, dents, 0.5 mm deep, of no size inspected are found")
+    depth_mm = float(re.search(r"from a depth of about ([\d.]+) mm on: Sharp One", output)[1])  # type: ignore[index]
+    found = [law_mm("sharp", "dent", Conditions(2.0, 0.6, 1, depth_mm * by)) for by in (0.7, 1.4)]
+    assert found[0] > 80 > found[1]  # the widest dents there are 80 mm wide
+
+
 @pytest.mark.parametrize(
     ("word", "titles"),
     [
