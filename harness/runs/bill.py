@@ -23,12 +23,14 @@ FIXED = ("imports", "plan", "statistics", "tables and page")
 
 class Bill:
     """Adds up the processor seconds of a run, phase after phase. The first is all that this
-    process has spent before: on imports, and on reading the experiment."""
+    process has spent before, and no earlier bill was charged with: on imports, and on reading the
+    experiment."""
+
+    _settled_s = 0.0  # of this process, by all bills
 
     def __init__(self) -> None:
         self._seconds = dict.fromkeys(PHASES, 0.0)
         self._phase = "imports"
-        self._settled_s = 0.0
 
     def begin(self, phase: str) -> None:
         """Charge a phase, from now on, with what this process spends and with jobs that end."""
@@ -38,8 +40,8 @@ class Bill:
     def _settle(self) -> None:
         """Charge what this process has spent since the last time."""
         now_s = time.process_time()
-        self._seconds[self._phase] += now_s - self._settled_s
-        self._settled_s = now_s
+        self._seconds[self._phase] += now_s - Bill._settled_s
+        Bill._settled_s = now_s
 
     def charge(self, job: Job, ended: Ended) -> None:
         """Charge a job that another process has done: a render, or a part of this phase."""

@@ -7,7 +7,7 @@ import argparse
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +48,11 @@ def _options(parser: argparse.ArgumentParser) -> None:
         " the answer is the size that is found)",
     )
     add("--depth", metavar="LENGTH", help="depth of the damage; not of a hole through the part")
+    add(
+        "--backing",
+        metavar="LENGTH",
+        help="distance of the surface behind a hole through the part (default: 20mm)",
+    )
     add("--distance", metavar="LENGTH", help="distance from camera to target, such as 1m")
     add("--frames", type=int, metavar="N", help="frames averaged (default: the fewest and most)")
     add(
@@ -101,10 +106,13 @@ def main(options: argparse.Namespace, command: str) -> int:
     if age:
         print(age)
     surfaces = [surface for shard, name in chosen for surface in shard.surfaces(kind, name)]
+    problems = _problems(used.values(), kind)
     if not surfaces:
-        raise UserError(f"--damage {options.damage}: is not in this atlas")
+        raise UserError(
+            f"--damage {options.damage}: is not in this atlas: {'; '.join(problems) or 'no law'}"
+        )
     asked = _asked(options, kind, surfaces)
-    size_mm = math.nan if options.size is None else 1e3 * length_m("--size", options.size)
+    size_mm = math.nan if options.size is None else _mm("--size", options.size)
     rows, reasons = _answers(surfaces, asked, size_mm)
     if not rows:
         raise UserError(
@@ -113,12 +121,17 @@ def main(options: argparse.Namespace, command: str) -> int:
         )
     warnings = _warnings(used.values())
     answer = _headline(kind, asked, rows, size_mm)
-    notes = [*_next_best(rows, size_mm), _basis(rows), *_assumed(kind, rows, used.values())]
+    notes = [
+        *_next_best(rows, size_mm),
+        *_deep_enough(rows),
+        _basis(rows),
+        *_assumed(kind, rows, used.values()),
+    ]
     if not options.camera:
         notes += _same(used.values())
     if called == "gouge":
         notes.append(SCRATCH)
-    notes += [f"not answered: {reason}" for reason in reasons]
+    notes += [f"not answered: {reason}" for reason in [*reasons, *problems]]
     exact = f"to compute the first row exactly: {_exactly(rows[0].surface, rows[0].conditions)}"
     _show(rows, answer, warnings, [*notes, exact])
     if options.out is not None:
@@ -201,27 +214,45 @@ def _asked(
     from harness.programs.atlas.limits import Conditions
 
     distance_m = length_m("--distance", options.distance)
-    depths_mm = [depth for surface in surfaces for depth in surface.ranges.get("depth_mm", ())]
-    depth_mm = None
-    if options.depth is not None:
-        if not depths_mm:
-            raise UserError(
-                "--depth: a hole through the part has none",
-                fix="leave it out, or ask for --damage blind",
-            )
-        depth_mm = 1e3 * length_m("--depth", options.depth)
-    elif depths_mm:
-        raise UserError(
-            f"--depth is missing: how deep is the {options.damage}?",
-            legal=f"{min(depths_mm):g} to {max(depths_mm):g} mm in this atlas; --size is its"
-            f" {SIZE_OF.get(kind, 'diameter')}",
-        )
+    depth_mm = _depth_mm(options, kind, surfaces)
     if options.frames is not None and options.frames < 1:
         raise UserError(f"--frames {options.frames}: must be 1 or more")
     if not 0 < options.albedo <= 1:
         raise UserError(f"--albedo {options.albedo:g}: must lie between 0 and 1")
     frames = [1, 50] if options.frames is None else [options.frames]
     return [Conditions(distance_m, options.albedo, count, depth_mm) for count in frames]
+
+
+def _depth_mm(options: argparse.Namespace, kind: str, surfaces: Sequence[LimitSurface]) -> float:
+    """Return the depth in question; of a hole through the part, the distance of what is behind.
+    Raises UserError if it is missing, or is none of this damage."""
+    from harness.programs.atlas.parts import BACKING_MM
+
+    if kind == "through":
+        if options.depth is not None:
+            raise UserError(
+                "--depth: a hole through the part has none",
+                fix="leave it out (--backing is the distance of the surface behind), or ask for"
+                " --damage blind",
+            )
+        return BACKING_MM if options.backing is None else _mm("--backing", options.backing)
+    if options.backing is not None:
+        raise UserError(
+            "--backing: is seen through holes only", fix="leave it out, or ask for --damage hole"
+        )
+    if options.depth is None:
+        ends = [depth for surface in surfaces for depth in surface.ranges["depth_mm"]]
+        raise UserError(
+            f"--depth is missing: how deep is the {options.damage}?",
+            legal=f"{min(ends):g} to {max(ends):g} mm in this atlas; --size is its"
+            f" {SIZE_OF.get(kind, 'diameter')}",
+        )
+    return _mm("--depth", options.depth)
+
+
+def _mm(option: str, value: str) -> float:
+    """Return a length with its unit in millimetres. Raises UserError."""
+    return 1e3 * length_m(option, value)
 
 
 def _answers(
@@ -244,6 +275,16 @@ def _answers(
     return rows, reasons
 
 
+def _problems(shards: Iterable[CameraLimits], kind: str) -> list[str]:
+    """Return why cameras have no law of a kind of damage."""
+    reasons = []
+    for shard in shards:
+        if kind not in shard.kinds:
+            why = "; ".join(shard.problems) or "no damage of that kind was judged"
+            reasons.append(f"{shard.titles[shard.camera]}: {why}")
+    return reasons
+
+
 def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_mm: float) -> str:
     """Return the answer in a sentence: what is found in how many set-ups or, without a size, which
     camera finds the smallest."""
@@ -251,11 +292,14 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
     from harness.vocabulary.text import many
 
     conditions = asked[0]
-    deep = "" if conditions.depth_mm is None else f", {conditions.depth_mm:g} mm deep,"
+    deep = "" if kind == "through" else f", {conditions.depth_mm:g} mm deep,"
     if math.isnan(size_mm):
         best = min(rows, key=order)
-        if math.isnan(best.answer.a90_mm):
-            return f"At {conditions.distance_m:g} m, no limit of {DAMAGE[kind]}s{deep} is known."
+        if best.answer.rank_mm == math.inf:
+            return (
+                f"At {conditions.distance_m:g} m, {DAMAGE[kind]}s{deep} of no size inspected are"
+                " found nine times out of ten."
+            )
         return (
             f"At {conditions.distance_m:g} m, {best.surface.title} finds the smallest"
             f" {DAMAGE[kind]}s{deep} nine times out of ten: {_interval(best)}"
@@ -273,9 +317,11 @@ def _headline(kind: str, asked: Sequence[Conditions], rows: Sequence[Row], size_
 
 
 def _interval(row: Row) -> str:
-    """Return ``2.8 mm (2.3 to 3.6 mm)``."""
-    answer = row.answer
-    return f"{answer.a90_mm:.2g} mm ({answer.low_mm:.2g} to {answer.high_mm:.2g} mm)"
+    """Return ``2.8 mm (2.3 to 3.6 mm)`` or ``≤ 2.1 mm``."""
+    from harness.programs.atlas.tables import a90
+
+    number, _, ends = a90(row).text(1).partition(" (")
+    return f"{number} mm ({ends.removesuffix(')')} mm)" if ends else f"{number} mm"
 
 
 def _next_best(rows: Sequence[Row], size_mm: float) -> list[str]:
@@ -286,14 +332,33 @@ def _next_best(rows: Sequence[Row], size_mm: float) -> list[str]:
 
     best, *others = sorted(rows, key=order)
     others = [row for row in others if row.surface.title != best.surface.title]
-    if not math.isnan(size_mm) or not others or math.isnan(others[0].answer.a90_mm):
+    if not math.isnan(size_mm) or not others or others[0].answer.rank_mm == math.inf:
         return []
     second = others[0]
-    order_is = "is certain" if second.answer.low_mm > best.answer.high_mm else "is not certain"
+    is_certain = second.answer.low_mm > best.answer.high_mm
+    order_is = "is certain" if is_certain else "is not certain"
     frames = many(second.conditions.frames, "frame")
     return [
         f"Next: {second.surface.title}, {_interval(second)} with {frames}; by their intervals, the"
         f" order of the two {order_is}."
+    ]
+
+
+def _deep_enough(rows: Sequence[Row]) -> list[str]:
+    """Say, where damage of this depth is found at no size, how deep it has to be; nothing where
+    there is a limit, or where none is found at any depth."""
+    from harness.programs.atlas.tables import deep_enough_mm
+    from harness.vocabulary.text import many
+
+    if any(row.answer.rank_mm < math.inf for row in rows):
+        return []
+    depths_mm = [(deep_enough_mm(row), row) for row in rows]
+    depth_mm, row = min(depths_mm, key=lambda pair: pair[0])
+    if depth_mm == math.inf:
+        return []
+    return [
+        f"Found at some size inspected from a depth of about {depth_mm:.2g} mm on:"
+        f" {row.surface.title}, {many(row.conditions.frames, 'frame')}."
     ]
 
 
@@ -324,11 +389,11 @@ def _same(shards: Any) -> list[str]:
 def _basis(rows: Sequence[Row]) -> str:
     """Say under what conditions the limits hold, and how well the laws predict set-ups."""
     text = "Simulated: one unit of each camera, under the conditions of atlas.yaml"
-    errors = [row.surface.error for row in rows if math.isfinite(row.surface.error)]
+    errors = [row.answer.size_error for row in rows if math.isfinite(row.answer.size_error)]
     if errors:
         text += (
-            "; fit error: of a90 at set-ups left out of the fit,"
-            f" {100 * max(errors):.0f} % (rms) at most"
+            "; law error: of a90 at distances left out of the law,"
+            f" {100 * max(errors):.0f} % at most"
         )
     return f"{text}."
 

@@ -1,10 +1,10 @@
 """Facts that limits assume and nobody has measured, and how far each moves a90, from the table
 ``unknowns.parquet`` of a study of unknowns (`experiments/detection_limit.yaml`)."""
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from harness.programs.atlas.limits import damage_of
 from harness.programs.atlas.tables import DAMAGE
 from harness.vocabulary.path_names import names_of
 from harness.vocabulary.text import many
@@ -26,7 +26,7 @@ def assumed(table: Sequence[Effect], kind: str, detector: str, frames: int) -> l
     names = names_of(sorted(value_by_key))
     stated = [f"{names[key]} {value_by_key[key]}" for key in sorted(value_by_key)]
     sentences = [f"Assumed, not measured: {', '.join(stated)}."]
-    comparable = [row for row in rows if damage_of(row[DAMAGE_COLUMN])[0] == kind]
+    comparable = [row for row in rows if json.loads(row[DAMAGE_COLUMN])["kind"] == kind]
     if not comparable:
         return [*sentences, f"How far these move limits of {DAMAGE[kind]}s is not computed."]
     of_detector = [row for row in comparable if row["detector"] == detector]

@@ -1,4 +1,4 @@
-"""``tofpod atlas``: computes the limits from which `tofpod ask` answers, camera by camera."""
+"""``tofpod atlas``: computes the laws from which `tofpod ask` answers, camera by camera."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from harness.runs.options import add_engine_options, add_results_folder, engine_
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import shipped
 from harness.vocabulary.program import program
+from harness.vocabulary.text import many
 
 if TYPE_CHECKING:
+    from harness.programs.atlas.making import Planned, Work
     from harness.programs.atlas.stored import CameraLimits
 
 MADE = Path("atlas") / "atlas.json"
@@ -32,52 +34,93 @@ def _options(parser: argparse.ArgumentParser) -> None:
 
 @program(
     _options,
-    "Compute limits of damage for each camera, at three distances of its range, and write the"
+    "Compute how well damage shows for each camera, at six distances of its range, and write the"
     f" atlas from which tofpod ask answers ({MADE} in the folder of results). A shard of"
-    " today's code is kept, also one that comes with tofpod.",
+    " today's code is kept, also one that comes with tofpod; a shard that was interrupted resumes.",
     "tofpod atlas kinect_v2 --dry-run",
     "tofpod atlas pmd_flexx2 realsense_l515",
     epilog="Then ask: tofpod ask --distance 1m --atlas results/atlas/atlas.json",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
-    from harness.programs.atlas.making import Planned
+    from harness.programs.atlas.making import DETECTOR, Planned, renders_of
     from harness.programs.atlas.shards import twins_of
     from harness.programs.atlas.stored import write_atlas
+    from harness.runs.engines import engine_of
     from scenes.sensor.camera import camera_names
 
     run_options = engine_options(options)
     if not run_options.shard.is_whole:
         raise UserError("--shard: the atlas has a shard for each camera", fix="name the cameras")
     twins = twins_of(camera_names())
-    chosen = _chosen(options.camera, twins)
     atlas_file = options.out / MADE
     stored = _stored(atlas_file)
-    totals = [0, 0, 0]
-    for names in chosen:
+    to_make = []
+    for names in _chosen(options.camera, twins):
         planned = Planned(names)
         current = stored.get(Path(planned.camera).stem)
         if current is not None and _is_current(current, planned.digests, names):
             print(f"{planned.camera}: of today's code")
-            continue
-        also = f" (also {', '.join(names[1:])})" if len(names) > 1 else ""
-        if options.dry_run:
-            work = planned.work(options.out)
-            totals = [total + count for total, count in zip(totals, work, strict=True)]
-            print(f"{planned.camera}{also}: {_in_words(work)}", flush=True)
-            continue
-        print(f"{planned.camera}{also}: {len(planned.parts)} distances", flush=True)
-        shard = planned.made(options.out, run_options, command)
-        if shard is None:
-            return 130
-        stored[shard.camera] = shard
-        write_atlas(atlas_file, list(stored.values()))
+        else:
+            to_make.append(planned)
     if options.dry_run:
-        print(f"in all: {_in_words(totals)}{_bill(options.out, totals)}")
-    else:
-        write_atlas(atlas_file, list(stored.values()))
-        print(f"atlas: {atlas_file}")
+        _list(to_make, options.out)
+        return 0
+    try:
+        with engine_of(run_options, {DETECTOR}, renders_of(options.out)) as engine:
+            for planned in to_make:
+                print(
+                    f"{_named(planned.names)}: {many(len(planned.parts), 'distance')}", flush=True
+                )
+                shard = planned.made(options.out, engine, command)
+                for line in _summary(shard):
+                    print(f"  {line}", flush=True)
+                stored[shard.camera] = shard
+                write_atlas(atlas_file, list(stored.values()))
+    except KeyboardInterrupt:
+        print(f"\ninterrupted; finished trials are kept. To continue:\n  {command}")
+        return 130
+    write_atlas(atlas_file, list(stored.values()))
+    print(f"atlas: {atlas_file}")
     return 0
+
+
+def _list(to_make: list[Planned], out: Path) -> None:
+    """Print the work on each camera, and what all is expected to cost."""
+    from harness.programs.atlas.making import EXPERIMENT, Work
+    from harness.runs.bill import expected
+
+    total = Work(parts=0, renders=0, trials=0)
+    for planned in to_make:
+        work = planned.work(out)
+        total = Work(
+            parts=total.parts + work.parts,
+            renders=total.renders + work.renders,
+            trials=total.trials + work.trials,
+        )
+        print(f"{_named(planned.names)}: {_in_words(work)}", flush=True)
+    cost = expected(out, EXPERIMENT, total.renders, total.trials)
+    print(f"in all: {_in_words(total)}{f'; {cost}' if cost else ''}")
+
+
+def _summary(shard: CameraLimits) -> list[str]:
+    """Return what could not be computed of a camera, and how well its laws hold."""
+    lines = list(shard.problems)
+    for kind, limits in shard.kinds.items():
+        hits = sum(set_up.hits for set_up in limits.set_ups)
+        sites = sum(set_up.sites for set_up in limits.set_ups)
+        error = limits.law.error
+        holds = "too few tell how well its law holds"
+        if error == error:
+            holds = f"signals at distances left out depart by {100 * error:.0f} %"
+        lines.append(f"{kind}: {hits} of {sites} found; {holds}")
+    return lines
+
+
+def _named(names: tuple[str, ...]) -> str:
+    """Return a camera's name, and those of its twins."""
+    also = f" (also {', '.join(names[1:])})" if len(names) > 1 else ""
+    return f"{names[0]}{also}"
 
 
 def _chosen(asked: list[str], twins: dict[str, list[str]]) -> list[list[str]]:
@@ -108,19 +151,9 @@ def _is_current(shard: CameraLimits, digests: dict[str, str], names: list[str]) 
     return shard.about.get("digests") == digests and list(shard.titles) == stems
 
 
-def _in_words(work: list[int] | tuple[int, int, int]) -> str:
-    """Return ``84 set-ups, 444 renders, 480 trials``."""
-    set_ups, renders, trials = work
-    return f"{set_ups} set-ups, {renders} renders, {trials} trials"
-
-
-def _bill(out: Path, work: list[int]) -> str:
-    """Return the processor seconds that the work is expected to cost, by earlier runs."""
-    from harness.programs.atlas.parts import EXPERIMENT
-    from harness.runs.bill import expected
-
-    text = expected(out, EXPERIMENT, work[1], work[2])
-    return f"; {text}" if text else ""
+def _in_words(work: Work) -> str:
+    """Return ``6 distances, 168 renders, 192 trials``."""
+    return f"{many(work.parts, 'distance')}, {work.renders} renders, {work.trials} trials"
 
 
 if __name__ == "__main__":

@@ -1,43 +1,28 @@
-"""The atlas of limits: for each camera and kind of damage, a90 of some set-ups as a smooth law of
-what the camera sees of the damage. It answers questions within the computed range and refuses
-others.
+"""Limits of a camera between the set-ups of the atlas, by the law of its signals
+(`harness.programs.atlas.law`): the size found nine times out of ten at conditions, and whether
+damage of a given size is found.
 
-What decides a limit is the noise of a pixel over the depth of the damage, and the width of a pixel
-on the target, which grows with the distance d. So
+An answer holds within the range of the computed set-ups in distance, albedo, frames and depth, in
+the noise of a pixel over that depth, and in sizes. Where the law reaches nine in ten at no size
+inspected, or already at the smallest, only that is said."""
 
-    ln a90 = c0 + c1 x + c2 ln d + c3 x^2,    x = ln(noise(d, albedo, frames) / depth),
-
-by least squares weighted with each limit's own interval. Frames, albedo and depth enter through x
-alone: the noise comes from the sensor model before an even plane (`PlaneNoise`), its temporal part
-over the root of the number of frames. The stated error is the root mean square error of ln a90 at
-each set-up when the others predict it.
-
-A limit is stated only between set-ups that have one: a set-up that is harder (not nearer, not less
-noisy) and others that are not farther and not noisier. Where a harder set-up finds all damage, or
-an easier one misses it, only that is said.
-
-Not modelled: what depends on albedo or depth in another way than by noise, such as light that is
-reflected within a deep hole; the error of the law shows it."""
-
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
+from harness.programs.atlas.law import MIDDLE_ALBEDO, Law
+from harness.vocabulary.geometry import MM
+
+FOUND = 0.9
+"""Probability of detection at a limit."""
 UPPER = 0.975
 """Upper end of intervals at 95 %."""
-UNKNOWN_VARIANCE = 0.25
-"""Variance of ln a90 if an interval has no positive lower end: a factor of 1.65 either way."""
-LEAST_VARIANCE = 1e-4
-"""Least variance of ln a90: 1 %. No limit is known better."""
-LEAST_FREE = 0.05
-"""Least share of a set-up's residual that the fit leaves, which divides it."""
-LEAST_FITTED = 6
-"""Least number of limits of a law without its curvature; with it, `LEAST_CURVED`."""
-LEAST_CURVED = 10
+SIZES = 97
+"""Sizes at which the law is evaluated; their logarithms are evenly spaced. Twelve times between
+the ends, neighbours differ by 2.6 %, and limits are interpolated between them."""
 TOLERANCE = 1e-6
 SAME_X = 0.05
 """Difference of x that counts as none: 5 % of the noise, which is known no better."""
@@ -60,50 +45,28 @@ class Conditions:
     """Of the target, at the camera's wavelength."""
     frames: int
     """Number of averaged frames."""
-    depth_mm: float | None = None
-    """Depth of the damage; None of through-holes."""
+    depth_mm: float
+    """Depth of the damage; of through-holes, distance of the surface behind the part."""
 
 
 @dataclass(frozen=True)
-class SetUp:
-    """A computed limit."""
+class FailedSetUp:
+    """A set-up in which no damage could be judged, as the camera saw too little of the board."""
 
-    kind: str
-    """Kind of damage."""
-    conditions: Conditions
-    """Where it was computed."""
-    a90_mm: float
-    """Size found 90 % of the time; NaN if none."""
-    low_mm: float
-    """Lower end of its 95 % interval; NaN if unknown."""
-    high_mm: float
-    """Upper end of its interval; NaN if unknown."""
-    smallest_mm: float
-    """Smallest size inspected."""
-    largest_mm: float
-    """Largest size inspected."""
-    is_at_most: bool
-    """Whether all damage was found, so that a90 is at most ``smallest_mm``."""
-    hits: int
-    """Number of damages found."""
+    distance_m: float
+    """Distance of the boards."""
+    albedo: float
+    """Of the boards."""
+    frames: int
+    """Number of averaged frames."""
 
-    @property
-    def has_limit(self) -> bool:
-        """True if a limit was found within the sizes inspected."""
-        return self.a90_mm <= self.largest_mm and not self.is_at_most
-
-    @property
-    def is_beyond(self) -> bool:
-        """True if the limit lies above all sizes inspected."""
-        return self.a90_mm > self.largest_mm or self.hits == 0
-
-    @property
-    def variance(self) -> float:
-        """The variance of ln a90, from its interval."""
-        if not (0 < self.low_mm < self.high_mm < np.inf):
-            return UNKNOWN_VARIANCE
-        deviation = np.log(self.high_mm / self.low_mm) / (2 * special.ndtri(UPPER))
-        return float(np.clip(deviation**2, LEAST_VARIANCE, UNKNOWN_VARIANCE))
+    def is_no_harder(self, conditions: Conditions) -> bool:
+        """Return whether it is not farther, not darker and of as many frames as conditions."""
+        return (
+            self.distance_m <= conditions.distance_m * (1 + TOLERANCE)
+            and self.albedo >= conditions.albedo * (1 - TOLERANCE)
+            and self.frames >= conditions.frames
+        )
 
 
 @dataclass(frozen=True)
@@ -119,18 +82,18 @@ class PlaneNoise:
     fixed_mm: np.ndarray
     """(d, a): deviation of what no averaging removes; NaN likewise."""
 
-    def at(self, conditions: Conditions) -> float:
-        """Return the noise of an average, millimetres; logarithms of the variances are linear in
-        those of distance and albedo. Raises Outside where the camera gives no depth."""
-        frame = self._between(self.frame_mm**2, conditions)
+    def at(self, conditions: Conditions) -> tuple[float, float]:
+        """Return the noise of an average, millimetres, and the share of its variance that no
+        averaging removes; logarithms of the variances are linear in those of distance and albedo.
+        Raises Outside where the camera gives no depth."""
+        frame = self._between(self.frame_mm**2, conditions) / conditions.frames
         fixed = self._between(self.fixed_mm**2, conditions)
-        noise_mm = float(np.sqrt(frame / conditions.frames + fixed))
-        if not np.isfinite(noise_mm):
+        if not np.isfinite(frame + fixed):
             raise Outside(
                 f"distance {conditions.distance_m:g} m, albedo {conditions.albedo:g}: the camera"
                 " gives no depth there or nearby (too much light, or too little)"
             )
-        return noise_mm
+        return float(np.sqrt(frame + fixed)), fixed / (frame + fixed)
 
     def _between(self, variances: np.ndarray, conditions: Conditions) -> float:
         """Interpolate variances (d, a) at conditions."""
@@ -154,46 +117,96 @@ def _neighbours(nodes: Sequence[float], value: float) -> tuple[list[int], np.nda
 
 @dataclass(frozen=True)
 class Answer:
-    """The limit at conditions, or the bounds that are known instead."""
+    """The limit at conditions."""
 
-    a90_mm: float = np.nan
-    """Size found 90 % of the time; NaN if it is not known."""
-    low_mm: float = np.nan
-    """Lower end of its 95 % interval."""
-    high_mm: float = np.nan
-    """Upper end of its interval."""
-    found_mm: float = np.nan
-    """Size from which on all was found in a harder set-up; NaN without such."""
-    missed_mm: float = np.nan
-    """Size up to which damage was missed more than once in ten in an easier set-up; NaN without
-    such."""
+    sizes_mm: np.ndarray
+    """(s,): ascending sizes, as far as they were inspected."""
+    middle: np.ndarray
+    """(s,): the law's ln(signal / threshold) there, above what is found nine times out of ten."""
+    half: np.ndarray
+    """(s,): half the width of its 95 % interval."""
+    grows: bool
+    """Whether larger damage is never harder to find; a wide dent of the same depth is."""
+    error: float
+    """Deviation of ln(signal / threshold) between the law and a set-up that was left out."""
+
+    @cached_property
+    def rank_mm(self) -> float:
+        """Key that sorts answers: the size found 90 % of the time, 0 if that is below the sizes
+        inspected and infinite if it is above."""
+        return self._first(self.middle)
+
+    @property
+    def a90_mm(self) -> float:
+        """Size found 90 % of the time; NaN if it is not within the sizes inspected."""
+        return self.rank_mm if 0 < self.rank_mm < np.inf else np.nan
+
+    @cached_property
+    def low_mm(self) -> float:
+        """Lower end of its 95 % interval; 0 below the sizes inspected, infinite above them."""
+        return self._first(self.middle + self.half)
+
+    @cached_property
+    def high_mm(self) -> float:
+        """Upper end of its interval, from which on damage is surely found: the smallest size
+        inspected if even that is, infinite above them."""
+        return max(self._first(self.middle - self.half), float(self.sizes_mm[0]))
+
+    @property
+    def found_mm(self) -> float:
+        """The smallest size inspected if even that is surely found, else NaN."""
+        smallest_mm = float(self.sizes_mm[0])
+        return smallest_mm if self.high_mm == smallest_mm else np.nan
+
+    @property
+    def missed_mm(self) -> float:
+        """The largest size inspected if the limit surely lies above it, else NaN."""
+        return float(self.sizes_mm[-1]) if self.low_mm == np.inf else np.nan
+
+    @cached_property
+    def lost_mm(self) -> float:
+        """Size above `high_mm` from which on damage is not surely found again; NaN if there is
+        none."""
+        if not np.isfinite(self.high_mm) or self.grows:
+            return np.nan
+        is_lost = (self.sizes_mm >= self.high_mm) & (self.middle - self.half < 0)
+        return float(self.sizes_mm[is_lost][0]) if is_lost.any() else float(self.sizes_mm[-1])
+
+    @cached_property
+    def size_error(self) -> float:
+        """The error in terms of the limit: relative deviation of a90 between the law and a set-up
+        that was left out; NaN without a limit."""
+        if np.isnan(self.a90_mm):
+            return np.nan
+        slopes = np.gradient(self.middle, np.log(self.sizes_mm))
+        slope = float(np.interp(np.log(self.a90_mm), np.log(self.sizes_mm), slopes))
+        return self.error / slope if slope > 0 else np.nan
 
     def verdict(self, size_mm: float) -> str:
         """Return whether damage of this size is found 9 times out of 10: yes, no or undecided."""
-        if self.high_mm <= size_mm or self.found_mm <= size_mm:
+        is_larger = size_mm > self.sizes_mm[-1] * (1 + TOLERANCE)
+        is_smaller = size_mm < self.sizes_mm[0] * (1 - TOLERANCE)
+        if is_larger and not self.grows:
+            return "undecided"
+        log_sizes = np.log(self.sizes_mm)
+        middle = np.interp(np.log(size_mm), log_sizes, self.middle)
+        half = np.interp(np.log(size_mm), log_sizes, self.half)
+        if middle - half >= 0 and not is_smaller:
             return "yes"
-        return "no" if self.low_mm > size_mm or self.missed_mm >= size_mm else "undecided"
+        return "no" if middle + half < 0 and not is_larger else "undecided"
 
-
-@dataclass(frozen=True)
-class Fit:
-    """The law of a90, by weighted least squares."""
-
-    coefficients: np.ndarray
-    """(t,): of 1, x, ln d and, with enough limits, x^2."""
-    covariance: np.ndarray
-    """(t, t): of the coefficients."""
-    degrees: int
-    """Degrees of freedom."""
-    error: float
-    """Root mean square error of ln a90 at each set-up when the others predict it."""
-
-    def log_a90(self, x: float, log_distance: float) -> tuple[float, float]:
-        """Return ln a90 at conditions, and half the width of its 95 % interval."""
-        terms = _terms(np.array([x]), np.array([log_distance]), len(self.coefficients))[0]
-        middle = float(terms @ self.coefficients)
-        deviation = np.hypot(np.sqrt(terms @ self.covariance @ terms), self.error)
-        return middle, float(special.stdtrit(self.degrees, UPPER) * deviation)
+    def _first(self, values: np.ndarray) -> float:
+        """Return the smallest size with a value of 0 or more, interpolated; 0 if it is the first,
+        infinity if none has."""
+        reached = np.flatnonzero(values >= 0)
+        if not len(reached):
+            return np.inf
+        index = int(reached[0])
+        if index == 0:
+            return 0.0
+        share = -values[index - 1] / (values[index] - values[index - 1])
+        below_mm = self.sizes_mm[index - 1]
+        return float(below_mm * (self.sizes_mm[index] / below_mm) ** share)
 
 
 @dataclass(frozen=True)
@@ -206,94 +219,68 @@ class LimitSurface:
     """Its title."""
     kind: str
     """Kind of damage."""
-    contrast_mm: float
-    """Depth of through-holes: the distance of the surface behind the board."""
+    thickness_mm: float
+    """Thickness of the boards, which a through-hole adds to the depth that is seen in it."""
     focal_px: float
     """Focal length, which gives the width of a pixel on the target."""
     noise: PlaneNoise
     """The camera's noise."""
-    set_ups: tuple[SetUp, ...]
-    """The computed set-ups that the law is fitted to."""
-    checks: tuple[SetUp, ...] = ()
-    """Computed set-ups that were kept aside, between the others."""
-
-    @cached_property
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """The computed range on each axis that this kind of damage has."""
-        ranges = {}
-        for axis in AXES:
-            values = [getattr(set_up.conditions, axis) for set_up in self.set_ups]
-            if None not in values:
-                ranges[axis] = (float(min(values)), float(max(values)))
-        return ranges
-
-    @cached_property
-    def fit(self) -> Fit | None:
-        """The law; None if too few set-ups have a limit."""
-        limited = [set_up for set_up in self.set_ups if set_up.has_limit]
-        if len(limited) < LEAST_FITTED:
-            return None
-        x = np.array([self.ratios[set_up] for set_up in limited])
-        log_distance = np.log([set_up.conditions.distance_m for set_up in limited])
-        log_a90 = np.log([set_up.a90_mm for set_up in limited])
-        variances = np.array([set_up.variance for set_up in limited])
-        return fitted(_terms(x, log_distance, _count(len(limited))), log_a90, variances)
+    law: Law
+    """The law of its signals."""
+    failed: tuple[FailedSetUp, ...]
+    """Set-ups in which nothing could be judged."""
+    sites: int
+    """Number of damages that were inspected."""
+    hits: int
+    """Number of them that were found."""
 
     @property
-    def error(self) -> float:
-        """Root mean square error of ln a90, leaving each set-up out; NaN without a law."""
-        return float("nan") if self.fit is None else self.fit.error
-
-    @cached_property
-    def ratios(self) -> dict[SetUp, float]:
-        """x of each computed set-up."""
-        return {set_up: self.ratio(set_up.conditions) for set_up in self.set_ups}
-
-    def ratio(self, conditions: Conditions) -> float:
-        """Return x: the logarithm of a pixel's noise over the damage's depth. Raises Outside."""
-        depth_mm = self.contrast_mm if conditions.depth_mm is None else conditions.depth_mm
-        return float(np.log(self.noise.at(conditions) / depth_mm))
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """The computed range on each axis."""
+        return {axis: self.law.ranges[axis] for axis in AXES}
 
     def at(self, conditions: Conditions) -> Answer:
         """Return the limit at conditions. Raises Outside beyond the computed range."""
         self._check_inside(conditions)
-        x = self.ratio(conditions)
-        harder = self._beside(lambda other: _is_harder(other, (x, conditions.distance_m)))
-        easier = self._beside(lambda other: _is_harder((x, conditions.distance_m), other))
-        found_mm = [set_up.smallest_mm for set_up in harder if set_up.is_at_most]
-        missed_mm = [set_up.largest_mm for set_up in easier if set_up.is_beyond]
-        known = Answer(
-            found_mm=min(found_mm, default=np.nan), missed_mm=max(missed_mm, default=np.nan)
+        for failed in self.failed:
+            if failed.is_no_harder(conditions):
+                raise Outside(
+                    f"at {failed.distance_m:g} m, albedo {failed.albedo:g}, frames"
+                    f" {failed.frames}, which is no harder, the camera saw too little of boards"
+                )
+        noise_mm, fixed_share = self.noise.at(conditions)
+        depth_mm = conditions.depth_mm
+        if self.kind == "through":
+            depth_mm += self.thickness_mm
+        x = float(np.log(noise_mm / depth_mm))
+        lowest, highest = self.law.ranges["x"]
+        if not lowest - SAME_X <= x <= highest + SAME_X:
+            raise Outside(
+                f"noise of {np.exp(x):.2g} of the depth: the atlas has {np.exp(lowest):.2g} to"
+                f" {np.exp(highest):.2g}"
+            )
+        if np.isnan(self.law.error):
+            raise Outside(
+                f"{self.hits} of {self.sites} such damages were found in all set-ups, too few or"
+                " too many to tell how well a law holds between them"
+            )
+        pixel_mm = pixel_width_mm(conditions.distance_m, self.focal_px)
+        log_sizes = np.linspace(*self.law.ranges["log_size_px"], SIZES)
+        others = (
+            x,
+            float(np.log(pixel_mm)),
+            fixed_share,
+            float(np.log(conditions.albedo / MIDDLE_ALBEDO)),
         )
-        if known.found_mm <= known.missed_mm:
-            return Answer()  # set-ups contradict one another
-        if self.fit is None or missed_mm or not self._is_between(x, conditions, harder):
-            return known
-        middle, half = self.fit.log_a90(x, float(np.log(conditions.distance_m)))
+        mean, deviation = self.law.signal(log_sizes, others)
+        factor = special.stdtrit(self.law.degrees, UPPER)
         return Answer(
-            a90_mm=float(np.exp(middle)),
-            low_mm=float(np.exp(middle - half)),
-            high_mm=float(np.exp(middle + half)),
-            found_mm=known.found_mm,
+            sizes_mm=np.exp(log_sizes) * pixel_mm,
+            middle=mean - self.law.scatter * special.ndtri(FOUND),
+            half=factor * deviation,
+            grows=self.kind != "dent",
+            error=self.law.error,
         )
-
-    def _is_between(self, x: float, conditions: Conditions, harder: Sequence[SetUp]) -> bool:
-        """Return whether set-ups with limits stand on all sides of conditions."""
-        limited = [set_up for set_up in self.set_ups if set_up.has_limit]
-        nearest_m = min(set_up.conditions.distance_m for set_up in limited)
-        least_x = min(self.ratios[set_up] for set_up in limited)
-        is_reached = any(set_up.has_limit for set_up in harder)
-        return (
-            is_reached and nearest_m <= conditions.distance_m + TOLERANCE and least_x <= x + SAME_X
-        )
-
-    def _beside(self, is_beside: Callable[[tuple[float, float]], bool]) -> list[SetUp]:
-        """Return the set-ups whose (x, distance) meets a condition."""
-        chosen = []
-        for set_up in self.set_ups:
-            if is_beside((self.ratios[set_up], set_up.conditions.distance_m)):
-                chosen.append(set_up)
-        return chosen
 
     def _check_inside(self, conditions: Conditions) -> None:
         for axis, (lowest, highest) in self.ranges.items():
@@ -301,47 +288,13 @@ class LimitSurface:
             if lowest * (1 - TOLERANCE) <= value <= highest * (1 + TOLERANCE):
                 continue
             unit = AXES[axis]
-            wanted = f"{axis.partition('_')[0]} {value:g} {unit}".rstrip()
+            name = axis.partition("_")[0]
+            if (self.kind, axis) == ("through", "depth_mm"):
+                name = "backing"
+            wanted = f"{name} {value:g} {unit}".rstrip()
             raise Outside(f"{wanted}: the atlas has {lowest:g} to {highest:g} {unit}".rstrip())
 
 
-def _is_harder(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Return whether the first of two (x, distance) is neither nearer nor less noisy."""
-    return one[0] >= other[0] - SAME_X and one[1] >= other[1] - TOLERANCE
-
-
-def _count(limits: int) -> int:
-    """Return the number of terms that so many limits fix."""
-    return 4 if limits >= LEAST_CURVED else 3
-
-
-def _terms(x: np.ndarray, log_distance: np.ndarray, count: int) -> np.ndarray:
-    """Return the value of each term of the law (n, count)."""
-    columns = [np.ones_like(x), x, log_distance, x**2]
-    return np.stack(columns[:count], axis=1)
-
-
-def fitted(design: np.ndarray, log_a90: np.ndarray, variances: np.ndarray) -> Fit:
-    """Fit ln a90 (n,) to terms (n, t) by least squares, weighted by 1 / variance. The residuals
-    widen the covariance if they are larger than the variances say."""
-    weights = 1.0 / variances
-    inverse = np.linalg.pinv(design.T @ (weights[:, None] * design))
-    coefficients = inverse @ (design.T @ (weights * log_a90))
-    residuals = log_a90 - design @ coefficients
-    degrees = len(residuals) - design.shape[1]
-    leverage = np.einsum("ij,jk,ik->i", design, inverse, design) * weights
-    left_out = residuals / np.maximum(1.0 - leverage, LEAST_FREE)
-    scale = max(1.0, float((weights * residuals**2).sum()) / degrees)
-    return Fit(
-        coefficients=coefficients,
-        covariance=inverse * scale,
-        degrees=degrees,
-        error=float(np.sqrt(np.mean(left_out**2))),
-    )
-
-
-def damage_of(text: str) -> tuple[str, float]:
-    """Return the kind and the mean depth in mm, NaN without one, that a declaration of damage in
-    JSON states."""
-    damage = json.loads(text)
-    return damage["kind"], float(np.mean(damage.get("depth_mm") or [np.nan]))
+def pixel_width_mm(distance_m: float, focal_px: float) -> float:
+    """Return the width of a pixel on a target at a distance, millimetres."""
+    return distance_m / focal_px / MM

@@ -1,33 +1,58 @@
-"""Makes shards of the atlas: runs the parts of a camera, and keeps what `tofpod ask` needs."""
+"""Makes shards of the atlas: runs the parts of a camera, and fits the laws that `tofpod ask`
+needs. The trials of a part are kept in its journal, so that a shard resumes; no limits, tables or
+pages of parts are made."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
+from detectors import detector_type
 from harness.experiment.digests import experiment_digests
-from harness.experiment.load import load_experiment
+from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.schema import Experiment
 from harness.programs.atlas.age import sources_digest
-from harness.programs.atlas.limits import Conditions, PlaneNoise, SetUp, damage_of
-from harness.programs.atlas.parts import EXPERIMENT, Part
-from harness.programs.atlas.shards import measured_noise, parts_of
-from harness.programs.atlas.stored import CameraLimits
-from harness.runs.options import EngineOptions
+from harness.programs.atlas.fitting import Sites, fitted
+from harness.programs.atlas.limits import FailedSetUp, PlaneNoise
+from harness.programs.atlas.parts import DEPTHS_MM, EXPERIMENT, Part
+from harness.programs.atlas.shards import measured_noise, parts_of, sites_of
+from harness.programs.atlas.stored import CameraLimits, KindLimits, SetUp
+from harness.records.outputs import EXPERIMENT as EXPERIMENT_FILE
+from harness.records.outputs import PROVENANCE
+from harness.runs.bill import BILL, Bill, Metered
+from harness.runs.estimate import progress_display
+from harness.runs.jobs import JobEngine, Outcome
+from harness.runs.journal import Journal
 from harness.runs.plan import plan_of
-from harness.runs.study import run_study
+from harness.runs.run import run_plan
+from harness.runs.shards import locked
+from harness.runs.tables import tables_of
 from harness.vocabulary.code_digests import Digests
-from harness.vocabulary.errors import UserError
-from harness.vocabulary.provenance import record
+from harness.vocabulary.errors import DiskFull, UserError
+from harness.vocabulary.files import write_json, write_text
+from harness.vocabulary.provenance import RESULTS_VERSION, record
 from harness.vocabulary.seeds import digest
+from scenes.render.cache import in_use
 from scenes.sensor.camera import guessed_precision, load_camera
 
-DAMAGE = "source.target.damage"
-ALBEDO = "source.target.material.albedo_850"
+DETECTOR = "matched"
+"""The experiment's detector, whose code worker processes load."""
 OF_A_PART = f"experiment {EXPERIMENT}"
 KEPT = ("commit", "dirty", "versions")
 """What a shard keeps of a run's provenance."""
+
+
+class Work(NamedTuple):
+    """The amount of work of a camera."""
+
+    parts: int
+    """Number of parts."""
+    renders: int
+    """Number of views."""
+    trials: int
+    """Number of trials."""
 
 
 class Planned:
@@ -38,11 +63,6 @@ class Planned:
         self.names = tuple(names)
         self.noise: PlaneNoise = measured_noise(names[0])
         self.parts: list[Part] = parts_of(names[0], self.noise)
-        if not self.parts:
-            raise UserError(
-                f"{names[0]}: gives no depth of any board between the ends of its range",
-                fix="correct its file; tofpod characterise measures a camera",
-            )
         self.experiments: list[Experiment] = [
             load_experiment(Path(EXPERIMENT), part.overrides) for part in self.parts
         ]
@@ -55,94 +75,170 @@ class Planned:
     @property
     def digests(self) -> Digests:
         """Digests of all that the shard hangs on: code, the camera's numbers, its experiments."""
+        if not self.experiments:  # no part: only the camera's numbers decide
+            return experiment_digests(
+                load_experiment(Path(EXPERIMENT), [f"source.camera.name={self.camera}"])
+            )
         parts = [experiment_digests(experiment) for experiment in self.experiments]
         digests = dict(parts[0])
         digests[OF_A_PART] = digest([part[OF_A_PART] for part in parts])
         return digests
 
-    def work(self, out: Path) -> tuple[int, int, int]:
-        """Return the numbers of set-ups, renders and trials."""
-        set_ups = 0
+    def work(self, out: Path) -> Work:
+        """Return the amount of work."""
         renders = 0
         trials = 0
         for experiment in self.experiments:
-            plan = plan_of(experiment, out / ".cache" / "renders")
-            set_ups += len(experiment.points)
+            plan = plan_of(experiment, renders_of(out))
             renders += len(plan.renders)
             for group in plan.groups:
                 trials += sum(group.most_repeats(batch) for batch in group.batches)
-        return set_ups, renders, trials
+        return Work(parts=len(self.parts), renders=renders, trials=trials)
 
-    def made(self, out: Path, options: EngineOptions, command: str) -> CameraLimits | None:
-        """Run all parts and return the shard; None if a run was interrupted."""
+    def made(self, out: Path, engine: JobEngine, command: str) -> CameraLimits:
+        """Run all parts and return the shard. What a part cannot do is said in the shard."""
         digests = self.digests
-        set_ups: list[SetUp] = []
-        checks: list[SetUp] = []
+        origin = record(command)
+        problems: list[str] = []
+        tables: list[tuple[Part, pd.DataFrame]] = []
+        if not self.parts:
+            problems.append("gives no depth of any board between the ends of its range")
+        failed: list[FailedSetUp] = []
         for part, experiment in zip(self.parts, self.experiments, strict=True):
             try:
-                code = run_study(experiment, out, options, command)
+                holes, why = judged(experiment, out, engine, origin)
+            except DiskFull:
+                raise
             except UserError as error:
-                print(f"{part.camera} at {part.distance_m:g} m: left out: {error.message}")
-                continue
-            if code == 130:
-                return None
-            limits = pd.read_parquet(experiment.folder(out) / "limits.parquet")
-            (checks if part.is_check else set_ups).extend(set_ups_of(limits, part))
-        if not set_ups:
-            raise UserError(f"{self.camera}: no part of it gave a limit")
-        origin = record(command)
-        config = self.experiments[0].config
-        backing = config.source.to_data()["target"]["backing"]
+                holes, why = None, error.message
+            if holes is not None:
+                tables.append((part, holes))
+            for frames in part.frames:
+                if holes is None or frames not in set(holes["frames"]):
+                    failed.append(FailedSetUp(part.distance_m, part.albedo, frames))
+            if why:
+                problems.append(f"at {part.distance_m:g} m, albedo {part.albedo:g}: {why}")
+        config = load_experiment(Path(EXPERIMENT)).config
         about: dict[str, Any] = {name: origin[name] for name in KEPT}
         about |= {
             "digests": digests,
             "sources": sources_digest(),
             "detector": config.detector.name,
-            "detector_version": int(limits["detector_version"].iloc[0]),
+            "detector_version": int(detector_type(config.detector.name).version),
             "focal_px": float(load_camera(self.camera).nominal_lens.fx),
-            "contrast_mm": float(backing["distance_mm"]),
+            "thickness_mm": float(config.source.to_data()["target"]["board"]["thickness_mm"]),
         }
-        return self._shard(about, set_ups, checks)
-
-    def _shard(
-        self, about: Mapping[str, Any], set_ups: Sequence[SetUp], checks: Sequence[SetUp]
-    ) -> CameraLimits:
         names = {name: Path(name).stem for name in self.names}
         return CameraLimits(
             camera=names[self.camera],
             titles={names[name]: load_camera(name).title for name in self.names},
             warning=guessed_precision(load_camera(self.camera)),
             about=about,
+            problems=tuple(problems),
+            failed=tuple(failed),
             noise=self.noise,
-            set_ups=tuple(set_ups),
-            checks=tuple(checks),
+            kinds=limits_of(tables, self.noise),
         )
 
 
-def set_ups_of(limits: pd.DataFrame, part: Part) -> list[SetUp]:
-    """Return the set-ups of a part from its table of limits."""
+def renders_of(out: Path) -> Path:
+    """Return the cache of renders of a folder of results."""
+    return (out / ".cache" / "renders").absolute()
+
+
+def judged(
+    experiment: Experiment, out: Path, engine: JobEngine, origin: Mapping[str, Any]
+) -> tuple[pd.DataFrame | None, str]:
+    """Run what the journal lacks of a part. Return its table of damages, None if no damage was
+    judged, and why something is missing, if it is."""
+    bill = Bill()
+    bill.begin("plan")
+    folder = experiment.folder(out)
+    cache = renders_of(out)
+    journal = Journal(folder / "journal")
+    plan = plan_of(experiment, cache, folder.absolute())
+    write_text(folder / EXPERIMENT_FILE.name, resolved_yaml(experiment))
+    with in_use(cache), locked(folder), progress_display() as report:
+        bill.begin("detection")
+        outcome = run_plan(plan, journal, Metered(engine, bill), report)
+    bill.begin("statistics")
+    tables = tables_of(journal.records(outcome.finished), experiment)
+    provenance = {
+        "results_version": RESULTS_VERSION,
+        **origin,
+        "experiment": experiment.config.name,
+        "digest": experiment.digest,
+        BILL: bill.rounded(),
+        "renders": {"done": outcome.renders.done},
+        "trials": {"done": outcome.trials.done},
+    }
+    if outcome.trials.done:  # a part that was there costs nothing, and tells nothing of the bill
+        write_json(folder / PROVENANCE.name, provenance)
+    return None if tables.holes.empty else tables.holes, _why(outcome)
+
+
+def _why(outcome: Outcome) -> str:
+    """Return why trials failed, in short; empty if all was done."""
+    reasons = {failure.in_short for failure in outcome.failures if failure.state != "skipped"}
+    return "; ".join(sorted(reasons)[:2])
+
+
+def limits_of(
+    tables: Sequence[tuple[Part, pd.DataFrame]], noise: PlaneNoise
+) -> dict[str, KindLimits]:
+    """Return the law of each kind of damage, from the damages of all parts. Thresholds of set-ups
+    differ by the chance of their few boards; limits hold for the middle one."""
+    thresholds = [
+        holes.groupby("frames")["threshold"].first().to_numpy(float) for _, holes in tables
+    ]
+    typical = float(np.median(np.concatenate(thresholds))) if thresholds else 1.0
+    kinds = {}
+    for kind in DEPTHS_MM:
+        sites: list[Sites] = []
+        used: list[Part] = []
+        for part, holes in tables:
+            own = holes[holes["kind"] == kind]
+            if not own.empty:
+                sites.append(sites_of(own, part, len(used), noise, typical))
+                used.append(part)
+        if used:
+            kinds[kind] = _limits_of_kind(kind, used, sites)
+    return kinds
+
+
+def _limits_of_kind(kind: str, parts: Sequence[Part], sites: Sequence[Sites]) -> KindLimits:
+    """Return the law of a kind of damage, and how its set-ups depart from it."""
+    joined = {name: np.concatenate([vars(part)[name] for part in sites]) for name in vars(sites[0])}
+    depths_mm = DEPTHS_MM[kind]
+    if depths_mm is None:
+        backings_mm = [part.backing_mm for part in parts]
+        depths_mm = (min(backings_mm), max(backings_mm))
+    albedos = [part.albedo for part in parts]
+    frames = [count for part in parts for count in part.frames]
+    distances_m = [part.distance_m for part in parts]
+    law, departures = fitted(
+        Sites(**joined),
+        {
+            "distance_m": (min(distances_m), max(distances_m)),
+            "frames": (float(min(frames)), float(max(frames))),
+            "albedo": (min(albedos), max(albedos)),
+            "depth_mm": depths_mm,
+        },
+    )
     set_ups = []
-    for row in limits.to_dict("records"):
-        kind, depth_mm = damage_of(row[DAMAGE])
-        # an axis of one value is no column
-        albedo = row[ALBEDO] if len(part.albedos) > 1 else part.albedos[0]
-        conditions = Conditions(
-            distance_m=part.distance_m,
-            albedo=float(albedo),
-            frames=int(row["frames"]),
-            depth_mm=None if depth_mm != depth_mm else depth_mm,
-        )
+    for departure in departures:
+        part = parts[departure.part]
         set_ups.append(
             SetUp(
-                kind=kind,
-                conditions=conditions,
-                a90_mm=float(row["a90_mm"]),
-                low_mm=float(row["a90_low_mm"]),
-                high_mm=float(row["a90_high_mm"]),
-                smallest_mm=float(row["smallest_mm"]),
-                largest_mm=float(row["largest_mm"]),
-                is_at_most=bool(row["is_at_most"]),
-                hits=int(row["hits"]),
+                distance_m=part.distance_m,
+                albedo=part.albedo,
+                backing_mm=part.backing_mm,
+                frames=departure.frames,
+                sites=departure.sites,
+                hits=departure.hits,
+                expected=departure.expected,
+                log_signal=departure.log_signal,
+                deviation=departure.deviation,
             )
         )
-    return set_ups
+    return KindLimits(law, tuple(set_ups))

@@ -63,7 +63,6 @@ def _curves(lines: Sequence[Row]) -> list[dict[str, Any]]:
             "frames": row.conditions.frames,
         }
         curve = curves.setdefault(tuple(settings.values()), dict(settings))
-        curve["error"] = _rounded(row.surface.error)
         numbers = {
             "distance_m": row.conditions.distance_m,
             "a90": row.answer.a90_mm,
@@ -71,6 +70,8 @@ def _curves(lines: Sequence[Row]) -> list[dict[str, Any]]:
             "high": row.answer.high_mm,
             "found": row.answer.found_mm,
             "missed": row.answer.missed_mm,
+            "lost": row.answer.lost_mm,
+            "error": row.answer.size_error,
         }
         for name, value in numbers.items():
             curve.setdefault(name, []).append(_rounded(value))
@@ -100,12 +101,15 @@ def save_atlas_png(path: Path, lines: Sequence[Row]) -> None:
                     if (row.surface.title, row.conditions.frames) == (title, count)
                 ]
                 distance_m = [row.conditions.distance_m for row in curve]
-                low_mm = [row.answer.low_mm for row in curve]
-                high_mm = [row.answer.high_mm for row in curve]
+                low_mm = [max(row.answer.low_mm, row.answer.sizes_mm[0]) for row in curve]
+                high_mm = [min(row.answer.high_mm, row.answer.sizes_mm[-1]) for row in curve]
                 panel.plot(
                     distance_m, [row.answer.a90_mm for row in curve], color=colour, label=title
                 )
-                panel.fill_between(distance_m, low_mm, high_mm, color=colour, alpha=0.12, lw=0)
+                is_known = np.isfinite([row.answer.a90_mm for row in curve])
+                panel.fill_between(
+                    distance_m, low_mm, high_mm, where=is_known, color=colour, alpha=0.12, lw=0
+                )
             panel.set(title=many(count, "frame"), xscale="log", yscale="log")
             panel.set_xlabel("distance (m)")
             plain_decades(panel.xaxis)

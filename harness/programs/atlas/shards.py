@@ -3,21 +3,20 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import pandas as pd
 
 from harness.experiment.digests import CAMERA_PART, camera_digests
-from harness.programs.atlas.limits import Conditions, Outside, PlaneNoise
+from harness.programs.atlas.fitting import Sites
+from harness.programs.atlas.law import MIDDLE_ALBEDO
+from harness.programs.atlas.limits import Conditions, Outside, PlaneNoise, pixel_width_mm
 from harness.programs.atlas.parts import (
+    BACKING_MM,
     BRIGHT,
-    CHECK_ALBEDO,
-    CHECK_FRAMES,
-    CHECK_SHARE,
-    CHECKED,
     COARSEST_PX_MM,
     DARK,
-    DEPTHS_MM,
     FARTHEST_M,
-    FRAMES,
     NEAREST_M,
+    PARTS,
     Part,
     between,
 )
@@ -37,77 +36,76 @@ inspected."""
 
 
 def parts_of(name: str, noise: PlaneNoise) -> list[Part]:
-    """Return the parts of a camera: at the ends of its range and between, where it gives a depth,
-    and of some cameras one that is kept aside.
+    """Return the parts of a camera, at distances between the ends of its range where it gives a
+    depth.
 
-    As albedo acts by noise alone, only the farthest part has both. The nearest is bright and the
-    middle one dark if the camera gives a depth there, so that the noises span all that is asked."""
+    Bright and dark targets alternate, where the camera sees them: what acts with distance is so
+    told from what acts with albedo."""
     distances_m = np.array(noise.distance_m)[np.isfinite(noise.frame_mm).any(axis=1)]
     if not len(distances_m):
         return []
-    nearest_m = float(distances_m[0])
-    farthest_m = float(distances_m[-1])
-    middle_m = between(nearest_m, farthest_m)
-    near = _part(name, nearest_m, _first_visible(noise, nearest_m, (BRIGHT, DARK)), FRAMES)
-    middle = _part(name, middle_m, _first_visible(noise, middle_m, (DARK, BRIGHT)), FRAMES)
-    far = _part(name, farthest_m, _visible(noise, farthest_m, (DARK, BRIGHT)), FRAMES)
-    parts = [near, middle, far]
-    if name in CHECKED:
-        check_m = between(nearest_m, middle_m, CHECK_SHARE)
-        albedos = _visible(noise, check_m, (CHECK_ALBEDO,))
-        parts.append(_part(name, check_m, albedos, (CHECK_FRAMES,), is_check=True))
-    return [part for part in parts if part.albedos]
+    focal_px = float(load_camera(name).nominal_lens.fx)
+    parts = []
+    for number, share in enumerate(np.linspace(0, 1, PARTS)):
+        distance_m = between(float(distances_m[0]), float(distances_m[-1]), share)
+        wanted = (BRIGHT, MIDDLE_ALBEDO, DARK)
+        if number % 2:
+            wanted = (DARK, MIDDLE_ALBEDO, BRIGHT)
+        albedo = _first_visible(noise, distance_m, wanted)
+        if albedo is not None:
+            part = Part(
+                camera=name,
+                distance_m=distance_m,
+                albedo=albedo,
+                backing_mm=BACKING_MM,
+                pixel_mm=pixel_width_mm(distance_m, focal_px),
+            )
+            parts.append(part)
+    return parts
 
 
-def _first_visible(
-    noise: PlaneNoise, distance_m: float, albedos: Sequence[float]
-) -> tuple[float, ...]:
-    """Return the first albedo at which the camera gives a depth at a distance, if any."""
-    return _visible(noise, distance_m, albedos)[:1]
-
-
-def _visible(noise: PlaneNoise, distance_m: float, albedos: Sequence[float]) -> tuple[float, ...]:
-    """Return those albedos at which the camera gives a depth at a distance."""
-    visible = []
-    for albedo in albedos:
-        try:
-            noise.at(Conditions(distance_m, albedo, frames=1))
-        except Outside:
-            continue
-        visible.append(albedo)
-    return tuple(visible)
-
-
-def _part(
-    name: str,
-    distance_m: float,
-    albedos: tuple[float, ...],
-    frames: tuple[int, ...],
-    *,
-    is_check: bool = False,
-) -> Part:
-    """Return the part at a distance."""
-    depths_mm = DEPTHS_MM
-    if is_check:
-        depths_mm = {kind: _kept_aside(depths) for kind, depths in DEPTHS_MM.items()}
-    return Part(
-        camera=name,
-        distance_m=distance_m,
-        albedos=albedos,
+def sites_of(
+    damages: pd.DataFrame, part: Part, number: int, noise: PlaneNoise, threshold: float
+) -> Sites:
+    """Return the damages of one kind of a part, as the law takes them. ``number``: the part's;
+    ``threshold``: the camera's typical one."""
+    size_mm = damages["true_diameter_mm"].to_numpy(float)
+    # what is visible from aside may be the wall of a hole: its whole depth counts
+    is_through = (damages["kind"] == "through").to_numpy()
+    depth_mm = damages["true_depth_mm"].to_numpy(float) + np.where(is_through, part.backing_mm, 0)
+    frames = damages["frames"].to_numpy(int)
+    noise_mm = np.zeros(len(damages))
+    fixed_share = np.zeros(len(damages))
+    for count in np.unique(frames):
+        conditions = Conditions(part.distance_m, part.albedo, int(count), part.backing_mm)
+        noise_mm[frames == count], fixed_share[frames == count] = noise.at(conditions)
+    signal = damages["signal"].to_numpy(float) / threshold
+    is_known = signal > 0
+    log_signal = np.full(len(damages), np.nan)
+    log_signal[is_known] = np.log(signal[is_known])
+    return Sites(
+        log_size_px=np.log(size_mm / part.pixel_mm),
+        x=np.log(noise_mm / depth_mm),
+        log_pixel_mm=np.full(len(damages), np.log(part.pixel_mm)),
+        fixed_share=fixed_share,
+        log_albedo=np.full(len(damages), np.log(part.albedo / MIDDLE_ALBEDO)),
+        log_signal=log_signal,
+        log_threshold=np.log(damages["threshold"].to_numpy(float) / threshold),
+        is_found=damages["detected"].to_numpy(bool),
+        part=np.full(len(damages), number),
         frames=frames,
-        pixel_mm=distance_m / load_camera(name).nominal_lens.fx / MM,
-        depths_mm=depths_mm,
-        is_check=is_check,
     )
 
 
-def _kept_aside(depths_mm: tuple[float | None, ...]) -> tuple[float | None, ...]:
-    """Return the depth between those that the law is fitted to; None of through-holes."""
-    lowest_mm = depths_mm[0]
-    highest_mm = depths_mm[-1]
-    if lowest_mm is None or highest_mm is None:
-        return (None,)
-    return (between(lowest_mm, highest_mm),)
+def _first_visible(noise: PlaneNoise, distance_m: float, albedos: Sequence[float]) -> float | None:
+    """Return the first albedo at which the camera gives a depth at a distance, if any."""
+    for albedo in albedos:
+        try:
+            noise.at(Conditions(distance_m, albedo, frames=1, depth_mm=BACKING_MM))
+        except Outside:
+            continue
+        return albedo
+    return None
 
 
 def measured_noise(name: str) -> PlaneNoise:

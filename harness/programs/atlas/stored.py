@@ -1,7 +1,8 @@
 """The stored atlas: a JSON file with a shard for each camera.
 
-A shard states its camera's title, cameras of the same numbers (``twins``), noise, limits, what
-they were computed with, and how precisely the camera's own noise is known."""
+A shard states its camera's title, cameras of the same numbers (``twins``), noise, the law of each
+kind of damage with the set-ups that it was fitted to, what they were computed with, what could not
+be computed, and how precisely the camera's own noise is known."""
 
 from __future__ import annotations
 
@@ -15,22 +16,59 @@ from typing import Any
 
 import numpy as np
 
-from harness.programs.atlas.limits import Conditions, LimitSurface, PlaneNoise, SetUp
+from harness.programs.atlas.law import TERMS, Law
+from harness.programs.atlas.limits import AXES, FailedSetUp, LimitSurface, PlaneNoise
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import TEXT_BYTES, bounded_bytes, strict_json, write_text
 
 STORED = "atlas.json"
 """The atlas that comes with tofpod, in baselines."""
-VERSION = 1
+VERSION = 2
 """Version of the file's layout."""
 LEGAL = "a file that tofpod atlas writes"
-NUMBERS = ("a90_mm", "low_mm", "high_mm", "smallest_mm", "largest_mm")
-COLUMNS = (
-    *("kind", "depth_mm", "distance_m", "albedo", "frames"),
-    *NUMBERS,
-    *("is_at_most", "hits", "is_check"),
-)
-"""Columns of a shard's rows; lengths are rounded to four digits."""
+DIGITS = 6
+"""Digits of stored coefficients and ranges; of all other numbers four."""
+LEAST_EIGENVALUE = 1e-6
+"""What rounding may take from the least eigenvalue of a covariance."""
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """The damages of a kind that were inspected in a set-up, and what the law of the other
+    distances expects of them."""
+
+    distance_m: float
+    """Distance of the boards."""
+    albedo: float
+    """Of the boards."""
+    backing_mm: float
+    """Distance of the surface behind them."""
+    frames: int
+    """Number of averaged frames."""
+    sites: int
+    """Number of damages."""
+    hits: int
+    """Number found."""
+    expected: float
+    """Number that the law expects to be found."""
+    log_signal: float
+    """Difference of ln(signal / threshold) from the law."""
+    deviation: float
+    """Its standard error by these damages alone."""
+
+
+SET_UP = tuple(SetUp.__annotations__)
+"""Columns of the rows of set-ups."""
+
+
+@dataclass(frozen=True)
+class KindLimits:
+    """The law of a kind of damage."""
+
+    law: Law
+    """The law."""
+    set_ups: tuple[SetUp, ...]
+    """What it was fitted to."""
 
 
 @dataclass(frozen=True)
@@ -44,30 +82,33 @@ class CameraLimits:
     warning: str
     """How uncertain the camera's own noise is; empty if it is measured."""
     about: Mapping[str, Any]
-    """What it was computed with: commit, versions, digests, detector, contrast."""
+    """What it was computed with: commit, versions, digests, detector, boards."""
+    problems: tuple[str, ...]
+    """What could not be computed, and why."""
+    failed: tuple[FailedSetUp, ...]
+    """Set-ups in which nothing could be judged."""
     noise: PlaneNoise
     """The camera's noise."""
-    set_ups: tuple[SetUp, ...]
-    """The computed limits."""
-    checks: tuple[SetUp, ...]
-    """Limits that were kept aside from the fit."""
+    kinds: Mapping[str, KindLimits]
+    """The law of each kind of damage."""
 
     def surfaces(self, kind: str, camera: str | None = None) -> list[LimitSurface]:
         """Return the surface of a kind of damage; none if the shard lacks it. ``camera``: the
         twin that it is shown as."""
-        set_ups = tuple(set_up for set_up in self.set_ups if set_up.kind == kind)
-        if not set_ups:
+        if kind not in self.kinds:
             return []
         name = camera or self.camera
         surface = LimitSurface(
             camera=name,
             title=self.titles[name],
             kind=kind,
-            contrast_mm=float(self.about["contrast_mm"]),
+            thickness_mm=float(self.about["thickness_mm"]),
             focal_px=float(self.about["focal_px"]),
             noise=self.noise,
-            set_ups=set_ups,
-            checks=tuple(check for check in self.checks if check.kind == kind),
+            law=self.kinds[kind].law,
+            failed=self.failed,
+            sites=sum(set_up.sites for set_up in self.kinds[kind].set_ups),
+            hits=sum(set_up.hits for set_up in self.kinds[kind].set_ups),
         )
         return [surface]
 
@@ -77,18 +118,34 @@ class CameraLimits:
             "titles": dict(self.titles),
             "warning": self.warning,
             "about": dict(self.about),
+            "problems": list(self.problems),
+            "failed": [list(vars(set_up).values()) for set_up in self.failed],
             "noise": {
                 "distance_m": list(self.noise.distance_m),
                 "albedo": list(self.noise.albedo),
                 "frame_mm": _stored_numbers(self.noise.frame_mm),
                 "fixed_mm": _stored_numbers(self.noise.fixed_mm),
             },
-            "columns": list(COLUMNS),
-            "rows": [
-                *(_row(set_up, is_check=False) for set_up in self.set_ups),
-                *(_row(set_up, is_check=True) for set_up in self.checks),
-            ],
+            "columns": list(SET_UP),
+            "kinds": {kind: _kind_data(limits) for kind, limits in self.kinds.items()},
         }
+
+
+def _kind_data(limits: KindLimits) -> dict[str, Any]:
+    """Return the law of a kind of damage and its set-ups as plain data."""
+    law = limits.law
+    ranges = {}
+    for name, ends in law.ranges.items():
+        ranges[name] = [_stored_number(end, DIGITS) for end in ends]
+    return {
+        "coefficients": [_stored_number(value, DIGITS) for value in law.coefficients],
+        "covariance": [[_stored_number(value, DIGITS) for value in row] for row in law.covariance],
+        "scatter": _stored_number(law.scatter),
+        "error": _stored_number(law.error),
+        "degrees": law.degrees,
+        "ranges": ranges,
+        "rows": [_row(set_up) for set_up in limits.set_ups],
+    }
 
 
 def read_atlas(path: Path) -> list[CameraLimits]:
@@ -109,13 +166,16 @@ def read_atlas(path: Path) -> list[CameraLimits]:
 
 
 def write_atlas(path: Path, shards: Sequence[CameraLimits]) -> None:
-    """Write an atlas, a row of limits on each line."""
+    """Write an atlas, a kind of damage of each camera on a line."""
     cameras = []
     for shard in sorted(shards, key=lambda shard: shard.camera):
         data = shard.to_data()
-        rows = ",\n".join(json.dumps(row, allow_nan=False) for row in data.pop("rows"))
+        kinds = []
+        for kind, limits in data.pop("kinds").items():
+            kinds.append(f"{json.dumps(kind)}: {json.dumps(limits, allow_nan=False)}")
+        rows = ",\n".join(kinds)
         head = json.dumps(data, allow_nan=False, ensure_ascii=False, sort_keys=True)
-        cameras.append(f'{json.dumps(shard.camera)}: {head[:-1]}, "rows": [\n{rows}]}}')
+        cameras.append(f'{json.dumps(shard.camera)}: {head[:-1]}, "kinds": {{\n{rows}}}}}')
     body = ",\n".join(cameras)
     write_text(path, f'{{"version": {VERSION}, "cameras": {{\n{body}}}}}\n')
 
@@ -124,7 +184,7 @@ def shard_of(camera: str, data: Mapping[str, Any]) -> CameraLimits:
     """Return a shard from plain data. Raises ValueError, KeyError or TypeError if it is none."""
     titles = {str(name): str(title) for name, title in data["titles"].items()}
     about = dict(data["about"])
-    for name in ("contrast_mm", "focal_px"):
+    for name in ("thickness_mm", "focal_px"):
         _above_0(name, about[name])
     if camera not in titles:
         raise ValueError(f"{camera}: it lacks its title")
@@ -132,64 +192,78 @@ def shard_of(camera: str, data: Mapping[str, Any]) -> CameraLimits:
     distances_m = _ascending(noise["distance_m"])
     albedos = _ascending(noise["albedo"])
     shape = (len(distances_m), len(albedos))
-    set_ups: list[SetUp] = []
-    checks: list[SetUp] = []
-    for values in data["rows"]:
-        row = dict(zip(data["columns"], values, strict=True))
-        (checks if row["is_check"] is True else set_ups).append(_set_up(row))
+    kinds = {}
+    for kind, limits in data["kinds"].items():
+        kinds[str(kind)] = _kind_of(data["columns"], limits)
     return CameraLimits(
         camera=camera,
         titles=titles,
         warning=str(data["warning"]),
         about=about,
+        problems=tuple(str(problem) for problem in data["problems"]),
+        failed=tuple(_failed_of(values) for values in data["failed"]),
         noise=PlaneNoise(
             distance_m=distances_m,
             albedo=albedos,
-            frame_mm=_numbers(noise["frame_mm"], shape),
-            fixed_mm=_numbers(noise["fixed_mm"], shape),
+            frame_mm=_not_negative("noise", noise["frame_mm"], shape),
+            fixed_mm=_not_negative("noise", noise["fixed_mm"], shape),
         ),
-        set_ups=tuple(set_ups),
-        checks=tuple(checks),
+        kinds=kinds,
     )
 
 
-def _row(set_up: SetUp, *, is_check: bool) -> list[Any]:
-    """Return the stored values of a set-up, in the order of `COLUMNS`."""
-    values: dict[str, Any] = {
-        "kind": set_up.kind,
-        **vars(set_up.conditions),
-        "is_at_most": set_up.is_at_most,
-        "hits": set_up.hits,
-        "is_check": is_check,
-    }
-    for name in NUMBERS:
-        number = getattr(set_up, name)
-        # the lower end of an interval may be 0, which has no logarithm: unknown
-        values[name] = _stored_number(number) if number > 0 else None
-    return [values[name] for name in COLUMNS]
+def _failed_of(values: Sequence[Any]) -> FailedSetUp:
+    """Return a set-up that failed. Raises ValueError for odd values."""
+    distance_m, albedo, frames = values
+    return FailedSetUp(
+        distance_m=_above_0("failed", distance_m),
+        albedo=_above_0("failed", albedo),
+        frames=int(_above_0("failed", frames)),
+    )
 
 
-def _set_up(row: Mapping[str, Any]) -> SetUp:
-    """Return the set-up of a stored row. Raises ValueError or TypeError for odd values."""
-    depth_mm = None if row["depth_mm"] is None else _above_0("depth_mm", row["depth_mm"])
-    frames = row["frames"]
-    hits = row["hits"]
-    if type(frames) is not int or frames < 1 or type(hits) is not int or hits < 0:
-        raise ValueError("frames or hits holds a value that is no count")
-    if type(row["is_at_most"]) is not bool or not isinstance(row["kind"], str):
-        raise TypeError("kind or is_at_most holds a value of another type")
-    numbers = {}
-    for name in NUMBERS:
-        numbers[name] = math.nan if row[name] is None else _above_0(name, row[name])
-    conditions = Conditions(
-        distance_m=_above_0("distance_m", row["distance_m"]),
-        albedo=_above_0("albedo", row["albedo"]),
-        frames=frames,
-        depth_mm=depth_mm,
+def _kind_of(columns: Sequence[str], data: Mapping[str, Any]) -> KindLimits:
+    """Return the law of a kind of damage from plain data. Raises ValueError, KeyError or
+    TypeError if it is none."""
+    count = len(TERMS)
+    ranges = {}
+    for name in (*AXES, "x", "log_size_px"):
+        low, high = (float(end) for end in data["ranges"][name])
+        if not -math.inf < low <= high < math.inf:
+            raise ValueError(f"the range of {name} does not ascend")
+        ranges[name] = (low, high)
+    if not ranges["log_size_px"][0] < ranges["log_size_px"][1]:
+        raise ValueError("the sizes are one size")
+    degrees = data["degrees"]
+    if type(degrees) is not int or degrees < 1:
+        raise ValueError(f"degrees holds {degrees!r}, which is no count")
+    coefficients = _table("coefficients", [data["coefficients"]], (1, count))[0]
+    covariance = _table("covariance", data["covariance"], (count, count))
+    if not np.isfinite(coefficients).all() or not np.isfinite(covariance).all():
+        raise ValueError("the law has unknown coefficients")
+    if np.linalg.eigvalsh(covariance).min() < -LEAST_EIGENVALUE:
+        raise ValueError("the covariance is none")
+    law = Law(
+        coefficients=coefficients,
+        covariance=covariance,
+        scatter=_above_0("scatter", data["scatter"]),
+        error=math.nan if data["error"] is None else _above_or_0("error", data["error"]),
+        degrees=degrees,
+        ranges=ranges,
     )
-    return SetUp(
-        kind=row["kind"], conditions=conditions, is_at_most=row["is_at_most"], hits=hits, **numbers
-    )
+    set_ups = []
+    for values in data["rows"]:
+        row = dict(zip(columns, values, strict=True))
+        set_ups.append(SetUp(**{name: row[name] for name in SET_UP}))
+    return KindLimits(law, tuple(set_ups))
+
+
+def _row(set_up: SetUp) -> list[Any]:
+    """Return the stored values of a set-up, in the order of `SET_UP`."""
+    values = []
+    for value in vars(set_up).values():
+        values.append(value if isinstance(value, int) else _stored_number(value))
+    return values
 
 
 def _above_0(name: str, value: Any) -> float:
@@ -207,11 +281,24 @@ def _ascending(values: Any) -> tuple[float, ...]:
     return numbers
 
 
-def _numbers(rows: Any, shape: tuple[int, int]) -> np.ndarray:
-    """Return a table (d, a) of stored numbers, NaN for None. Raises ValueError for odd ones."""
+def _above_or_0(name: str, value: Any) -> float:
+    """Return a number of 0 or more. Raises ValueError for any other value."""
+    return 0.0 if value == 0 and not isinstance(value, bool) else _above_0(name, value)
+
+
+def _not_negative(name: str, rows: Any, shape: tuple[int, int]) -> np.ndarray:
+    """Return a table of numbers of 0 or more, NaN for None. Raises ValueError for odd ones."""
+    table = _table(name, rows, shape)
+    if (table < 0).any():
+        raise ValueError(f"the table of {name} has negative numbers")
+    return table
+
+
+def _table(name: str, rows: Any, shape: tuple[int, int]) -> np.ndarray:
+    """Return a table of stored numbers, NaN for None. Raises ValueError for another shape."""
     table = np.array([[math.nan if v is None else float(v) for v in row] for row in rows])
-    if table.shape != shape or (table < 0).any():
-        raise ValueError("the table of noise has another shape, or negative numbers")
+    if table.shape != shape:
+        raise ValueError(f"the table of {name} has another shape")
     return table
 
 
@@ -220,6 +307,6 @@ def _stored_numbers(table: np.ndarray) -> list[list[float | None]]:
     return [[_stored_number(value) for value in row] for row in table]
 
 
-def _stored_number(value: float) -> float | None:
-    """Return a number with four digits, or None if it is not finite."""
-    return float(f"{value:.4g}") if np.isfinite(value) else None
+def _stored_number(value: float, digits: int = 4) -> float | None:
+    """Return a number with so many digits, or None if it is not finite."""
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None

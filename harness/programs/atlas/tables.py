@@ -11,6 +11,10 @@ from harness.records.schema import Column, Estimate, Table
 
 DAMAGE = {"through": "through-hole", "blind": "blind hole", "dent": "dent", "slot": "crack or slot"}
 """Names of kinds of damage in words."""
+DEPTHS = 33
+"""Number of depths at which damage that is deep enough is looked for."""
+BEYOND = 1.001
+"""Value of a limit that lies above all sizes inspected, over the largest."""
 DISTANCES = 13
 """Number of distances on a curve; their logarithms are evenly spaced."""
 
@@ -39,26 +43,27 @@ class Row:
         return "" if np.isnan(self.size_mm) else self.answer.verdict(self.size_mm)
 
 
-def damage_words(kind: str, depth_mm: float | None) -> str:
+def damage_words(kind: str, depth_mm: float) -> str:
     """Return the name of a kind of damage, with its depth."""
     words = DAMAGE.get(kind, kind)
-    return words if depth_mm is None else f"{words} {depth_mm:g} mm deep"
+    return words if kind == "through" else f"{words} {depth_mm:g} mm deep"
 
 
-def _a90(row: Row) -> Estimate:
+def a90(row: Row) -> Estimate:
     """Return the limit with its interval, or the bound that is known instead."""
     answer = row.answer
-    if np.isnan(answer.a90_mm) and not np.isnan(answer.missed_mm):
-        return Estimate(answer.missed_mm * 1.001, most=answer.missed_mm)
-    if np.isnan(answer.a90_mm) and not np.isnan(answer.found_mm):
-        return Estimate(answer.found_mm, at_most=True)
-    return Estimate(answer.a90_mm, answer.low_mm, answer.high_mm)
+    largest_mm = float(answer.sizes_mm[-1])
+    if answer.rank_mm == 0:
+        return Estimate(float(answer.sizes_mm[0]), at_most=True)
+    return Estimate(
+        min(answer.rank_mm, BEYOND * largest_mm), answer.low_mm, answer.high_mm, most=largest_mm
+    )
 
 
 def _error(row: Row) -> str:
-    """Return the error of the surface in percent, if the row has a limit."""
-    error = row.surface.error
-    return f"{100 * error:.0f} %" if np.isfinite(row.answer.a90_mm) else ""
+    """Return the error of the law in percent of the limit, if the row has one."""
+    error = row.answer.size_error
+    return f"{100 * error:.0f} %" if np.isfinite(error) else ""
 
 
 ATLAS = Table(
@@ -73,25 +78,28 @@ ATLAS = Table(
         Column("frames", "frames", "conditions.frames", "number of averaged frames"),
         Column("albedo", "albedo", "conditions.albedo", "the target's albedo"),
         Column(
-            "depth_mm", "", "conditions.depth_mm", "depth of the damage; empty of through-holes"
+            "depth_mm",
+            "",
+            "conditions.depth_mm",
+            "depth of the damage; of through-holes, distance of the surface behind the part",
         ),
         Column(
             "a90_mm",
             "a90 (mm)",
-            _a90,
-            "size found 90 % of the time (of a slot its width), with the 95 % interval of the"
-            " surface; the largest size inspected if an easier set-up misses such damage, the"
-            " smallest if a harder one finds it; empty if unknown",
+            a90,
+            "size found 90 % of the time (of a slot its width), with its 95 % interval; above the"
+            " largest size inspected if the limit is, and the smallest if all is found. An end of"
+            " the interval is 0 below the sizes inspected, and infinite above",
             interval=True,
         ),
         Column(
-            "surface_error",
+            "law_error",
             "error",
-            "surface.error",
-            "rms error of ln a90 when each set-up is left out in turn",
+            "answer.size_error",
+            "deviation of ln a90 between the law and set-ups at distances that were left out",
             brief=False,
         ),
-        Column("", "fit error", _error, "", text=str),
+        Column("", "law error", _error, "", text=str),
         Column(
             "found",
             "found?",
@@ -119,10 +127,21 @@ def rows_at(
     return sorted(rows, key=order), refused
 
 
-def order(row: Row) -> tuple[bool, float, str]:
-    """Return what sorts rows: known limits first, by size."""
-    size_mm = np.nan_to_num(row.answer.a90_mm, nan=row.answer.found_mm)
-    return bool(np.isnan(size_mm)), float(np.nan_to_num(size_mm)), row.surface.title
+def order(row: Row) -> tuple[float, float, str]:
+    """Return what sorts rows: by the limit, and by its lower end where it lies above the sizes
+    inspected."""
+    return row.answer.rank_mm, row.answer.low_mm, row.surface.title
+
+
+def deep_enough_mm(row: Row) -> float:
+    """Return the least depth of the atlas, from that of the question on, at which damage of some
+    size is found nine times out of ten; infinite if there is none."""
+    _, deepest_mm = row.surface.ranges["depth_mm"]
+    for depth_mm in np.geomspace(row.conditions.depth_mm, deepest_mm, DEPTHS):
+        deeper, _ = rows_at([row.surface], replace(row.conditions, depth_mm=float(depth_mm)))
+        if deeper and deeper[0].answer.rank_mm < np.inf:
+            return float(depth_mm)
+    return np.inf
 
 
 def curves(surfaces: Sequence[LimitSurface], asked: Sequence[Conditions]) -> list[Row]:

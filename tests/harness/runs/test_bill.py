@@ -16,6 +16,7 @@ from tests.support import faulty_jobs
 def test_phases_are_charged_with_this_process_and_with_jobs(monkeypatch):
     clock = {"s": 2.0}
     monkeypatch.setattr(bills.time, "process_time", lambda: clock["s"])
+    monkeypatch.setattr(Bill, "_settled_s", 0.0)
     bill = Bill()
     bill.begin("detection")
     clock["s"] = 3.0
@@ -35,6 +36,9 @@ def test_phases_are_charged_with_this_process_and_with_jobs(monkeypatch):
         "tables and page": 0.0,
     }
     assert bill.in_words().startswith("processor seconds: 20.8 (imports 2.0, plan 0.0, ")
+    clock["s"] = 4.5
+    # a second run of this process: what was charged before is not charged again
+    assert Bill().rounded()["imports"] == 1.0
 
 
 def test_a_process_says_what_its_jobs_cost():
