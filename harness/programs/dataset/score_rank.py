@@ -159,7 +159,7 @@ def answer(rows: Sequence[Ranked]) -> str:
             sentences.append(f"{place}no method has a limit within the sizes inspected.")
             continue
         size = a90_of(row.limit).text()
-        found = f"{record.detector} finds damage of {size} mm nine times out of ten"
+        found = f"{record.detector} finds the smallest damage nine times out of ten: {size} mm"
         sentences.append(f"{place}{found}.")
     return " ".join(sentences)
 
