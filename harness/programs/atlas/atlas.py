@@ -47,6 +47,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     from harness.programs.atlas.shards import twins_of
     from harness.programs.atlas.stored import write_atlas
     from harness.runs.engines import engine_of
+    from scenes.render.cache import trim_cache
     from scenes.sensor.camera import camera_names
 
     run_options = engine_options(options)
@@ -72,7 +73,9 @@ def main(options: argparse.Namespace, command: str) -> int:
                 print(
                     f"{_named(planned.names)}: {many(len(planned.parts), 'distance')}", flush=True
                 )
-                shard = planned.made(options.out, engine, command)
+                shard = planned.made(
+                    options.out, engine, command, retry_failed=run_options.retry_failed
+                )
                 for line in _summary(shard):
                     print(f"  {line}", flush=True)
                 stored[shard.camera] = shard
@@ -81,6 +84,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         print(f"\ninterrupted; finished trials are kept. To continue:\n  {command}")
         return 130
     write_atlas(atlas_file, list(stored.values()))
+    if run_options.cache_limit_gb is not None:
+        trim_cache(renders_of(options.out), round(run_options.cache_limit_gb * 1e9))
     print(f"atlas: {atlas_file}")
     return 0
 

@@ -95,7 +95,9 @@ class Planned:
                 trials += sum(group.most_repeats(batch) for batch in group.batches)
         return Work(parts=len(self.parts), renders=renders, trials=trials)
 
-    def made(self, out: Path, engine: JobEngine, command: str) -> CameraLimits:
+    def made(
+        self, out: Path, engine: JobEngine, command: str, *, retry_failed: bool = False
+    ) -> CameraLimits:
         """Run all parts and return the shard. What a part cannot do is said in the shard."""
         digests = self.digests
         origin = record(command)
@@ -106,7 +108,7 @@ class Planned:
         failed: list[FailedSetUp] = []
         for part, experiment in zip(self.parts, self.experiments, strict=True):
             try:
-                holes, why = judged(experiment, out, engine, origin)
+                holes, why = judged(experiment, out, engine, origin, retry_failed=retry_failed)
             except DiskFull:
                 raise
             except UserError as error:
@@ -147,7 +149,12 @@ def renders_of(out: Path) -> Path:
 
 
 def judged(
-    experiment: Experiment, out: Path, engine: JobEngine, origin: Mapping[str, Any]
+    experiment: Experiment,
+    out: Path,
+    engine: JobEngine,
+    origin: Mapping[str, Any],
+    *,
+    retry_failed: bool,
 ) -> tuple[pd.DataFrame | None, str]:
     """Run what the journal lacks of a part. Return its table of damages, None if no damage was
     judged, and why something is missing, if it is."""
@@ -160,7 +167,8 @@ def judged(
     write_text(folder / EXPERIMENT_FILE.name, resolved_yaml(experiment))
     with in_use(cache), locked(folder), progress_display() as report:
         bill.begin("detection")
-        outcome = run_plan(plan, journal, Metered(engine, bill), report)
+        metered = Metered(engine, bill)
+        outcome = run_plan(plan, journal, metered, report, retry_failed=retry_failed)
     bill.begin("statistics")
     tables = tables_of(journal.records(outcome.finished), experiment)
     provenance = {

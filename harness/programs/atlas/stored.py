@@ -28,6 +28,10 @@ VERSION = 2
 LEGAL = "a file that tofpod atlas writes"
 DIGITS = 6
 """Digits of stored coefficients and ranges; of all other numbers four."""
+LARGEST = 1e4
+"""Bound of stored coefficients and ranges; beyond it a file is no atlas."""
+LARGEST_LOG = 20.0
+"""Bound of logarithms of sizes in pixels."""
 LEAST_EIGENVALUE = 1e-6
 """What rounding may take from the least eigenvalue of a covariance."""
 
@@ -229,18 +233,19 @@ def _kind_of(columns: Sequence[str], data: Mapping[str, Any]) -> KindLimits:
     ranges = {}
     for name in (*AXES, "x", "log_size_px"):
         low, high = (float(end) for end in data["ranges"][name])
-        if not -math.inf < low <= high < math.inf:
+        if not -LARGEST < low <= high < LARGEST:
             raise ValueError(f"the range of {name} does not ascend")
         ranges[name] = (low, high)
-    if not ranges["log_size_px"][0] < ranges["log_size_px"][1]:
-        raise ValueError("the sizes are one size")
+    if not -LARGEST_LOG < ranges["log_size_px"][0] < ranges["log_size_px"][1] < LARGEST_LOG:
+        raise ValueError("the range of log_size_px does not ascend, or is no logarithm of pixels")
     degrees = data["degrees"]
     if type(degrees) is not int or degrees < 1:
         raise ValueError(f"degrees holds {degrees!r}, which is no count")
     coefficients = _table("coefficients", [data["coefficients"]], (1, count))[0]
     covariance = _table("covariance", data["covariance"], (count, count))
-    if not np.isfinite(coefficients).all() or not np.isfinite(covariance).all():
-        raise ValueError("the law has unknown coefficients")
+    for numbers in (coefficients, covariance):
+        if not (np.abs(numbers) < LARGEST).all():
+            raise ValueError("the law has unknown or huge coefficients")
     if np.linalg.eigvalsh(covariance).min() < -LEAST_EIGENVALUE:
         raise ValueError("the covariance is none")
     law = Law(
@@ -253,9 +258,26 @@ def _kind_of(columns: Sequence[str], data: Mapping[str, Any]) -> KindLimits:
     )
     set_ups = []
     for values in data["rows"]:
-        row = dict(zip(columns, values, strict=True))
-        set_ups.append(SetUp(**{name: row[name] for name in SET_UP}))
+        set_ups.append(_set_up(dict(zip(columns, values, strict=True))))
     return KindLimits(law, tuple(set_ups))
+
+
+def _set_up(row: Mapping[str, Any]) -> SetUp:
+    """Return the set-up of a stored row. Raises ValueError for odd values."""
+    for name in ("frames", "sites", "hits"):
+        if type(row[name]) is not int or row[name] < 0:
+            raise ValueError(f"{name} holds {row[name]!r}, which is no count")
+    return SetUp(
+        distance_m=_above_0("distance_m", row["distance_m"]),
+        albedo=_above_0("albedo", row["albedo"]),
+        backing_mm=_above_0("backing_mm", row["backing_mm"]),
+        frames=row["frames"],
+        sites=row["sites"],
+        hits=row["hits"],
+        expected=_above_or_0("expected", row["expected"]),
+        log_signal=float(row["log_signal"]),
+        deviation=_above_0("deviation", row["deviation"]),
+    )
 
 
 def _row(set_up: SetUp) -> list[Any]:

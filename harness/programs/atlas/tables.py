@@ -128,9 +128,10 @@ def rows_at(
 
 
 def order(row: Row) -> tuple[float, float, str]:
-    """Return what sorts rows: by the limit, and by its lower end where it lies above the sizes
-    inspected."""
-    return row.answer.rank_mm, row.answer.low_mm, row.surface.title
+    """Return what sorts rows: by the limit, or the size that it is known to lie below, and by its
+    lower end where it lies above the sizes inspected."""
+    answer = row.answer
+    return max(answer.rank_mm, float(answer.sizes_mm[0])), answer.low_mm, row.surface.title
 
 
 def deep_enough_mm(row: Row) -> float:

@@ -52,8 +52,8 @@ def test_the_answer_is_that_of_the_law(size: str, atlas: Path, capsys: pytest.Ca
 def test_without_a_size_the_smallest_found_is_the_answer(
     atlas: Path, capsys: pytest.CaptureFixture[str]
 ):
-    output = said("--damage dents --depth 1mm --distance 0.5m", atlas, capsys)
-    assert output.startswith("At 0.5 m, Sharp One, short mode finds the smallest dents, 1 mm deep,")
+    output = said("--damage dents --depth 1.5mm --distance 1m", atlas, capsys)
+    assert output.startswith("At 1 m, Sharp One, short mode finds the smallest dents, 1.5 mm deep,")
     assert "with 50 frames" in output.splitlines()[0] and "found?" not in output
     assert "Next: Dim 2, " in output and "order of the two is" in output
     assert "The same numbers: Twin Two as Sharp One, short mode." in output

@@ -53,6 +53,7 @@ def test_intervals_hold_the_law_between_set_ups():
             for conditions in BETWEEN:
                 conditions = replace(conditions, depth_mm=depth_mm or conditions.depth_mm)
                 answer = between.at(conditions)
+                assert (answer.half > 1.96 * between.law.error).all()
                 covered.append(answer.low_mm <= law_mm("sharp", kind, conditions) <= answer.high_mm)
                 widths.append(answer.high_mm / max(answer.low_mm, answer.sizes_mm[0]))
     assert np.mean(covered) > 0.93 and np.median(widths) < 1.6

@@ -79,7 +79,7 @@ def test_a_shard_is_made_once_and_again_only_after_a_stop(
     runs: list[float] = []
     stream = np.random.default_rng(1)
 
-    def run(experiment, out, engine, origin):  # type: ignore[no-untyped-def]
+    def run(experiment, out, engine, origin, *, retry_failed):  # type: ignore[no-untyped-def]
         distance_m = experiment.config.source.target.distance_m
         runs.append(distance_m)
         if len(runs) == 2:
