@@ -82,6 +82,14 @@ def test_a_target_at_the_pictures_edge_is_cut_off_and_one_that_moves_is_sought_a
     assert after.drift.change_m == 0 and np.isnan(after.drift.per_s)
 
 
+def test_a_frame_that_is_displaced_as_a_whole_counts_in_nothing():
+    first, second = watched(frame(i, farther_m=0.017 if i == 2 else 0.0) for i in range(20))
+    assert (first.left_out, second.left_out) == (1, 0)
+    assert "1 frame displaced" in first.line and "displaced" not in second.line
+    assert first.noise_m == pytest.approx(NOISE_M, rel=0.05)
+    assert abs(second.drift.change_m) < 0.1 * MM and not second.is_new
+
+
 def test_without_a_surface_no_target_is_in_view():
     nothing = replace(
         frame(0),
