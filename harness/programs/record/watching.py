@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import trim_mean
 
 from detectors.averages.average import RECORDED, average
 from detectors.crop import CUT_OFF, RIM_PX, AutoCrop, choice_of, described_text
@@ -23,6 +24,8 @@ MOST_JUDGED = 16
 SPAN_S = 120.0
 """Time over which the drift is fitted: two minutes tell .02 mm/min from none where the seconds'
 levels err by .05 mm."""
+TRIMMED = 0.25
+"""Share of pixels at each end that a level leaves out: what passes before the target."""
 FEWEST_LEVELS = 6
 """Seconds from which a line of drift is fitted."""
 SIGNIFICANT = 3.0
@@ -52,7 +55,7 @@ class WarmUp:
     """The change of the target's distance, which somebody who moves the camera changes as well."""
 
     change_m: float
-    """Median change since the target was found."""
+    """Mean change of the middle half of its pixels since the target was found."""
     per_s: float
     """Slope over the last `SPAN_S`, m/s; NaN while it is not known."""
     error_per_s: float
@@ -143,7 +146,7 @@ class Watch:
         self._reference_m: np.ndarray | None = None
         """Mean distance (h, w) of the second in which the target was sought."""
         self._levels: list[tuple[float, float]] = []
-        """Time and median change of each second since then."""
+        """Time and change of each second since then."""
 
     def add(self, frame: Frame, time_s: float) -> Second | None:
         """Take the next frame. Returns a second when this frame begins the next one."""
@@ -179,7 +182,9 @@ class Watch:
         judged = self._target.judged if self._target else everywhere
         inside = self._target.inside if self._target else everywhere
         change_m = (mean_m - self._reference_m)[judged]
-        level_m = float(np.nanmedian(change_m)) if np.isfinite(change_m).any() else np.nan
+        known_m = change_m[np.isfinite(change_m)]
+        # a median would move in the steps of stored distances
+        level_m = float(trim_mean(known_m, TRIMMED)) if known_m.size else np.nan
         time_s = self._last_s - self._first_s
         self._levels.append((time_s, level_m))
         second = Second(

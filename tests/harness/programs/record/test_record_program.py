@@ -131,6 +131,14 @@ def test_the_drift_of_frames_is_that_of_the_target():
     assert seconds[-1].drift.is_warming
 
 
+def test_a_drift_below_the_step_of_stored_distances_is_seen():
+    drawn = (frame(i, noise_m=0.7 * MM, farther_m=0.004 * MM * i) for i in range(100))
+    whole = (replace(each, z_m=np.round(each.z_m, 3)) for each in drawn)
+    seconds = watched(whole)
+    assert seconds[-1].drift.change_m == pytest.approx(0.36 * MM, abs=0.01 * MM)
+    assert seconds[-1].drift.per_s == pytest.approx(0.04 * MM, rel=0.05)
+
+
 # ---------------------------------------------------------------- what is written
 
 
