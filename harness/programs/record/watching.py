@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import trim_mean
 
 from detectors.averages.average import RECORDED, average
 from detectors.crop import CUT_OFF, RIM_PX, AutoCrop, choice_of, described_text
@@ -13,8 +14,8 @@ from detectors.pixels.masks import inset
 from detectors.recordings import Recording
 from detectors.sources.interface import Stream
 from harness.stills.statistics import temporal_sigma_m
-from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Frame, Lens
+from harness.vocabulary.geometry import MM, Cloud, Frame, Lens
+from harness.vocabulary.text import many
 
 PERIOD_S = 1.0
 """Time between two lines."""
@@ -23,6 +24,8 @@ MOST_JUDGED = 16
 SPAN_S = 120.0
 """Time over which the drift is fitted: two minutes tell .02 mm/min from none where the seconds'
 levels err by .05 mm."""
+TRIMMED = 0.25
+"""Share of pixels at each end that a level leaves out: what passes before the target."""
 FEWEST_LEVELS = 6
 """Seconds from which a line of drift is fitted."""
 SIGNIFICANT = 3.0
@@ -52,7 +55,7 @@ class WarmUp:
     """The change of the target's distance, which somebody who moves the camera changes as well."""
 
     change_m: float
-    """Median change since the target was found."""
+    """Mean change of the middle half of its pixels since the target was found."""
     per_s: float
     """Slope over the last `SPAN_S`, m/s; NaN while it is not known."""
     error_per_s: float
@@ -86,6 +89,8 @@ class Second:
     """Standard deviation of single pixels over frames, rms; NaN below two frames."""
     fill_rate: float
     """Share of the target's pixels with a distance."""
+    left_out: int
+    """Frames that jump or are disturbed, which count in nothing here."""
     drift: WarmUp
     """The drift so far."""
     target: WatchedTarget | None
@@ -103,6 +108,8 @@ class Second:
             self.drift.text,
             self.target.text if self.target else "no target in view",
         ]
+        if self.left_out:
+            parts.append(f"{many(self.left_out, 'frame')} displaced or disturbed")
         return ", ".join(parts)
 
     def to_data(self) -> dict[str, object]:
@@ -112,6 +119,7 @@ class Second:
             "frames": self.frames,
             "noise_mm": self.noise_m / MM,
             "fill_rate": self.fill_rate,
+            "frames_left_out": self.left_out,
             "drift_mm": self.drift.change_m / MM,
             "drift_mm_per_min": 60 * self.drift.per_s / MM,
             "drift_error_mm_per_min": 60 * self.drift.error_per_s / MM,
@@ -138,7 +146,7 @@ class Watch:
         self._reference_m: np.ndarray | None = None
         """Mean distance (h, w) of the second in which the target was sought."""
         self._levels: list[tuple[float, float]] = []
-        """Time and median change of each second since then."""
+        """Time and change of each second since then."""
 
     def add(self, frame: Frame, time_s: float) -> Second | None:
         """Take the next frame. Returns a second when this frame begins the next one."""
@@ -160,18 +168,23 @@ class Watch:
         return self._judged() if self._frames else None
 
     def _judged(self) -> Second:
-        stack_m = np.stack([frame.z_m for frame in self._frames])
-        mean_m = _mean(stack_m)
+        cloud = _averaged(self._stream, self._frames)
+        left_out = {frame.name for frame in cloud.left_out} if cloud else set()
+        used = [frame for frame in self._frames if frame.name not in left_out]
+        stack_m = np.stack([frame.z_m for frame in used])
+        mean_m = cloud.points_m[..., 2] if cloud else np.full(stack_m.shape[1:], np.nan)
         is_new = self._reference_m is not None and self._has_changed(stack_m, mean_m)
         if self._reference_m is None or is_new:
-            self._target = _target_of(self._stream, self._frames)
+            self._target = _target_in(cloud) if cloud else None
             self._reference_m = mean_m
             self._levels = []
         everywhere = np.ones(mean_m.shape, bool)
         judged = self._target.judged if self._target else everywhere
         inside = self._target.inside if self._target else everywhere
         change_m = (mean_m - self._reference_m)[judged]
-        level_m = float(np.nanmedian(change_m)) if np.isfinite(change_m).any() else np.nan
+        known_m = change_m[np.isfinite(change_m)]
+        # a median would move in the steps of stored distances
+        level_m = float(trim_mean(known_m, TRIMMED)) if known_m.size else np.nan
         time_s = self._last_s - self._first_s
         self._levels.append((time_s, level_m))
         second = Second(
@@ -179,6 +192,7 @@ class Watch:
             frames=self._count,
             noise_m=temporal_sigma_m(stack_m, judged) if len(stack_m) > 1 else np.nan,
             fill_rate=float(np.isfinite(stack_m[:, inside]).mean()),
+            left_out=len(left_out),
             drift=drift_of(self._levels),
             target=self._target,
             is_new=is_new,
@@ -212,13 +226,6 @@ def compile_loops() -> None:
     watch.ended()
 
 
-def _mean(stack_m: np.ndarray) -> np.ndarray:
-    """Return the mean (h, w) of frames (n, h, w) without NaN; NaN where no frame has a distance."""
-    count = np.isfinite(stack_m).sum(axis=0)
-    total_m = np.nansum(stack_m, axis=0, dtype=np.float64)
-    return np.where(count > 0, total_m / np.maximum(count, 1), np.nan)
-
-
 def drift_of(levels: Sequence[tuple[float, float]]) -> WarmUp:
     """Return the drift of levels in m at times in s, by a straight line through those of the last
     `SPAN_S`. Not modelled: seconds that err alike, which make its error too small."""
@@ -235,8 +242,9 @@ def drift_of(levels: Sequence[tuple[float, float]]) -> WarmUp:
     return WarmUp(change_m, slope, float(np.sqrt(variance / square)))
 
 
-def _target_of(stream: Stream, frames: Sequence[Frame]) -> WatchedTarget | None:
-    """Return the surface that `tofpod detect` chooses in these frames; None if it finds none."""
+def _averaged(stream: Stream, frames: Sequence[Frame]) -> Cloud | None:
+    """Return the average of frames without those that jump or are disturbed, as `tofpod detect`
+    makes it; None if no pixel has a distance."""
 
     def read() -> Iterator[Frame]:
         return iter(frames)
@@ -250,10 +258,15 @@ def _target_of(stream: Stream, frames: Sequence[Frame]) -> WatchedTarget | None:
         z_step_m=stream.unit_m,
         lens=stream.lens,
     )
-    try:
-        choice = choice_of(average(source, RECORDED), AutoCrop())
-    except UserError:  # nothing that could be averaged is in view
+    if not any(np.isfinite(frame.z_m).any() for frame in frames):
         return None
+    return average(source, RECORDED)
+
+
+def _target_in(cloud: Cloud) -> WatchedTarget | None:
+    """Return the surface that `tofpod detect` chooses in an average; None without a large smooth
+    one."""
+    choice = choice_of(cloud, AutoCrop())
     if not choice.candidates:
         return None
     candidate = choice.candidates[choice.taken - 1]

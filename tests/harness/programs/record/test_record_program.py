@@ -82,6 +82,14 @@ def test_a_target_at_the_pictures_edge_is_cut_off_and_one_that_moves_is_sought_a
     assert after.drift.change_m == 0 and np.isnan(after.drift.per_s)
 
 
+def test_a_frame_that_is_displaced_as_a_whole_counts_in_nothing():
+    first, second = watched(frame(i, farther_m=0.017 if i == 2 else 0.0) for i in range(20))
+    assert (first.left_out, second.left_out) == (1, 0)
+    assert "1 frame displaced" in first.line and "displaced" not in second.line
+    assert first.noise_m == pytest.approx(NOISE_M, rel=0.05)
+    assert abs(second.drift.change_m) < 0.1 * MM and not second.is_new
+
+
 def test_without_a_surface_no_target_is_in_view():
     nothing = replace(
         frame(0),
@@ -121,6 +129,14 @@ def test_the_drift_of_frames_is_that_of_the_target():
     assert seconds[-1].drift.change_m == pytest.approx(4.5 * MM, abs=0.1 * MM)
     assert seconds[-1].drift.per_s == pytest.approx(0.5 * MM, rel=0.03)
     assert seconds[-1].drift.is_warming
+
+
+def test_a_drift_below_the_step_of_stored_distances_is_seen():
+    drawn = (frame(i, noise_m=0.7 * MM, farther_m=0.004 * MM * i) for i in range(100))
+    whole = (replace(each, z_m=np.round(each.z_m, 3)) for each in drawn)
+    seconds = watched(whole)
+    assert seconds[-1].drift.change_m == pytest.approx(0.36 * MM, abs=0.01 * MM)
+    assert seconds[-1].drift.per_s == pytest.approx(0.04 * MM, rel=0.05)
 
 
 # ---------------------------------------------------------------- what is written
