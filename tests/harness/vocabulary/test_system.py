@@ -225,9 +225,7 @@ def test_detect_finds_the_hole_with_the_platform_taken_away(tmp_path: Path) -> N
     (
         "programs/keeping/test_listing.py",
         "runs/test_engine.py",
-        "runs/test_engine_faults.py",
         "runs/test_engine_processes.py",
-        "runs/test_engine_run.py",
         "runs/test_journal.py",
         "vocabulary/test_errors.py",
         "vocabulary/test_files.py",
@@ -238,4 +236,5 @@ def test_the_suite_passes_with_the_platform_taken_away(file: str) -> None:
     """Sweeps by one process and by several, locks, resumption after Ctrl-C, `ls`, `clean`."""
     where = ROOT / "tests" / "harness" / file
     options = ("-q", "-n", "0", "-p", "no:cacheprovider", "--tb=short")
-    print(run_bare("-m", "pytest", *options, where))
+    # the tests themselves write files without naming an encoding
+    run_bare("-m", "pytest", *options, where, PYTHONUTF8="1")
