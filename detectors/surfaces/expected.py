@@ -38,6 +38,8 @@ from harness.vocabulary.geometry import (
 )
 
 SAMPLE = 4000
+FEW = 500
+"""Points that choose among several starts."""
 STEPS = 20
 """Number of steps by closest points (twice as many by distances follow, then as many by planes).
 """
@@ -172,6 +174,11 @@ def diagonal(points: np.ndarray) -> float:
 def sampled(points: np.ndarray) -> np.ndarray:
     """Return some `SAMPLE` of points (n, 3), evenly strided."""
     return points[:: max(1, len(points) // SAMPLE)]
+
+
+def few_of(sample: np.ndarray) -> np.ndarray:
+    """Return some `FEW` of points (n, 3), evenly strided."""
+    return sample[:: max(1, len(sample) // FEW)]
 
 
 def fitted(
