@@ -72,6 +72,8 @@ class PartScan:
     """Its surface."""
     coarse: Triangles
     """The same through medians of cells."""
+    pitch_m: float
+    """Typical distance between neighbours."""
     share_px: float
     """Number of neighbours that share their noise."""
     parts: int = 1
@@ -146,6 +148,7 @@ def _scan(
     if not len(coarse_faces):
         raise no_surface
     triangles = _towards_viewer(points_m, faces, variances_m2, central)
+    sides_m = np.linalg.norm(triangles.corners_m[:, 0] - triangles.corners_m[:, 1], axis=1)
     return PartScan(
         name=name,
         points_m=points_m,
@@ -153,6 +156,7 @@ def _scan(
         noise_m2=noise_m2,
         triangles=triangles,
         coarse=_towards_viewer(coarse_m, coarse_faces, np.zeros(count), central),
+        pitch_m=float(np.median(sides_m)),
         share_px=share_px,
         parts=parts,
     )

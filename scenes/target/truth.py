@@ -192,7 +192,7 @@ def _casting_face(shape: custom.CastingConfig) -> Face:
 
     def casting(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         none = np.zeros(x.shape)
-        left = (1.0 + none, none, none, none, none, none)
+        left: tuple[np.ndarray, ...] = (1.0 + none, none, none, none, none, none)
         for middle_mm in (-shape.ribs_x_mm, shape.ribs_x_mm):
             share, slope, bend = _ridge(x - middle_mm * MM, shape.rib_width_mm * MM, flank_m)
             left = _product(left, (1.0 - share, -slope, none, -bend, none, none))
