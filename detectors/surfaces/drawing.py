@@ -44,6 +44,8 @@ from harness.vocabulary.meshes import (
 
 ROLLS = 4
 """Starts by quarters of a turn."""
+FEW = 500
+"""Points that choose among the starts."""
 
 
 class DrawingFile(Config):
@@ -109,7 +111,7 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
 
 def _placed(front: Triangles, sample: np.ndarray) -> Pose:
     """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
-    few = few_of(sample)
+    few = few_of(sample, FEW)
     starts = [_start(front, sample, turn) for turn in range(ROLLS)]
     tried = [fitted(front, few, start) for start in starts]
     return fitted(front, sample, starts[tried.index(closest_of(tried))])

@@ -38,8 +38,6 @@ from harness.vocabulary.geometry import (
 )
 
 SAMPLE = 4000
-FEW = 500
-"""Points that choose among several starts."""
 STEPS = 20
 """Number of steps by closest points (twice as many by distances follow, then as many by planes).
 """
@@ -173,12 +171,12 @@ def diagonal(points: np.ndarray) -> float:
 
 def sampled(points: np.ndarray) -> np.ndarray:
     """Return some `SAMPLE` of points (n, 3), evenly strided."""
-    return points[:: max(1, len(points) // SAMPLE)]
+    return few_of(points, SAMPLE)
 
 
-def few_of(sample: np.ndarray) -> np.ndarray:
-    """Return some `FEW` of points (n, 3), evenly strided."""
-    return sample[:: max(1, len(sample) // FEW)]
+def few_of(sample: np.ndarray, count: int) -> np.ndarray:
+    """Return some ``count`` of points (n, 3), evenly strided."""
+    return sample[:: max(1, len(sample) // count)]
 
 
 def fitted(

@@ -48,6 +48,8 @@ LONGEST_EDGES = 3.0
 COARSE = 4.0
 """Side, in typical edges, of the cells whose medians place a scan: their noise is a quarter of a
 pixel's, so that it hardly turns the triangles."""
+FEW = 150
+"""Points that choose among orientations: their mean distance is known to a tenth."""
 BETTER = 0.8
 """Another orientation is taken if its mean distance is less than this share of the first's."""
 SCATTER_PX = 5
@@ -206,7 +208,7 @@ def placed(
     if known is not None:
         best = fitted(scan.coarse, sample, known.T_part_camera, known, share_px=shared)
     else:
-        start = _best_start(scan, points_m, few_of(sample))
+        start = _best_start(scan, points_m, few_of(sample, FEW))
         best = fitted(scan.coarse, sample, start, share_px=shared)
     return refined(scan.triangles, best, sample, central=central, known=known, share_px=shared)
 
