@@ -23,6 +23,7 @@ from detectors.surfaces.expected import (
     closest_of,
     diagonal,
     expected,
+    few_of,
     fitted,
     met,
     normals_of,
@@ -110,7 +111,7 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
 
 def _placed(front: Triangles, sample: np.ndarray) -> Pose:
     """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
-    thinned = sample[:: max(1, len(sample) // FEW)]
+    thinned = few_of(sample, FEW)
     starts = [_start(front, sample, turn) for turn in range(ROLLS)]
     poses = [fitted(front, thinned, start) for start in starts]
     best = poses.index(closest_of(poses))

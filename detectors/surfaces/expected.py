@@ -171,7 +171,12 @@ def diagonal(points: np.ndarray) -> float:
 
 def sampled(points: np.ndarray) -> np.ndarray:
     """Return some `SAMPLE` of points (n, 3), evenly strided."""
-    return points[:: max(1, len(points) // SAMPLE)]
+    return few_of(points, SAMPLE)
+
+
+def few_of(sample: np.ndarray, count: int) -> np.ndarray:
+    """Return some ``count`` of points (n, 3), evenly strided."""
+    return sample[:: max(1, len(sample) // count)]
 
 
 def fitted(

@@ -30,6 +30,7 @@ from detectors.surfaces.expected import (
     another_part,
     diagonal,
     expected,
+    few_of,
     fitted,
     met,
     normals_of,
@@ -47,8 +48,8 @@ LONGEST_EDGES = 3.0
 COARSE = 4.0
 """Side, in typical edges, of the cells whose medians place a scan: their noise is a quarter of a
 pixel's, so that it hardly turns the triangles."""
-SAME_PLACE_PX = 1.0
-"""Mean distance, in pixels, at which the first start is good enough to try no other."""
+FEW = 150
+"""Points that choose among orientations: their mean distance is known to a tenth."""
 BETTER = 0.8
 """Another orientation is taken if its mean distance is less than this share of the first's."""
 SCATTER_PX = 5
@@ -207,14 +208,21 @@ def placed(
     if known is not None:
         best = fitted(scan.coarse, sample, known.T_part_camera, known, share_px=shared)
     else:
-        first, *later_starts = _starts(scan.points_m, points_m)
-        best = fitted(scan.coarse, sample, first, share_px=shared)
-        is_near = best.apart_m < SAME_PLACE_PX * scan.pitch_m
-        for start in [] if is_near else later_starts:
-            pose = fitted(scan.coarse, sample, start, share_px=shared)
-            if pose.apart_m < BETTER * best.apart_m:
-                best = pose
+        start = _best_start(scan, points_m, few_of(sample, FEW))
+        best = fitted(scan.coarse, sample, start, share_px=shared)
     return refined(scan.triangles, best, sample, central=central, known=known, share_px=shared)
+
+
+def _best_start(scan: PartScan, points_m: np.ndarray, few_m: np.ndarray) -> np.ndarray:
+    """Return the start (4, 4) from which some of a part's points (n, 3) come closest to a scan. All
+    are tried: the outline of a part that lies upside down may fit to a pixel."""
+    starts = _starts(scan.points_m, points_m)
+    apart_m = [fitted(scan.coarse, few_m, start).apart_m for start in starts]
+    best = 0
+    for number in range(1, len(starts)):
+        if apart_m[number] < BETTER * apart_m[best]:
+            best = number
+    return starts[best]
 
 
 def _starts(scan_m: np.ndarray, part_m: np.ndarray) -> list[np.ndarray]:

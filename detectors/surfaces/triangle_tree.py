@@ -15,7 +15,6 @@ CURVE_BITS = 20  # of a triangle's place on the curve, along one axis
 MOST_WAITING = 64  # nodes that wait while one is visited: one for each level
 # a ray that passes between two triangles by rounding meets both; a share of a triangle's side
 ON_EDGE = 1e-12
-ACROSS = 1e300
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
 
@@ -154,10 +153,9 @@ def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
 
 @numba.njit(inline="always", **PLAIN)
 def _inverse(component: float) -> float:
-    """Return the reciprocal of a ray's component; of a ray across the axis, a number that puts all
-    but the planes through its origin beyond every box."""
+    """Return the reciprocal of a ray's component; 0 for a ray across the axis."""
     if component == 0.0:
-        return ACROSS
+        return 0.0
     return 1.0 / component
 
 
@@ -169,6 +167,10 @@ def _entry(boxes: np.ndarray, node: int, origin: Vector, reciprocal: Vector) -> 
     entry = 0.0
     leave = np.inf
     for axis in range(3):
+        if reciprocal[axis] == 0.0:
+            if origin[axis] < low[axis] or origin[axis] > high[axis]:
+                return np.inf
+            continue
         to_low = (low[axis] - origin[axis]) * reciprocal[axis]
         to_high = (high[axis] - origin[axis]) * reciprocal[axis]
         first = to_low if reciprocal[axis] > 0.0 else to_high

@@ -51,7 +51,7 @@ def quick_overrides(data: Any) -> list[str]:
     overrides += [f"{path}={count}" for path, count in counts.items()]
     if is_study:
         trials = sum(count for path, count in counts.items() if path.endswith("boards"))
-        views = trials
+        views = trials + _reference_views(data, trials)
     else:
         trials = counts.get("repeats", 1) + counts.get(CALIBRATION_REPEATS, 0)
         views = 2  # with and without damage
@@ -80,6 +80,22 @@ def _fewer_boards(data: Any) -> dict[str, int]:
             third = ceil(boards / 3)
             counts[path] = min(boards, max(third, least.get(path, 1)))
     return counts
+
+
+def _reference_views(data: Any, boards: int) -> int:
+    """Return the number of views of what ``boards`` boards are compared with."""
+    references = shape.get(data, ("sweep", "compared_with"))
+    if not isinstance(references, list):
+        references = [shape.get(data, ("compared_with",))]
+    views = 0
+    most_parts = 0
+    for reference in references:
+        kind = shape.child(reference, "kind")
+        if kind == "scan":
+            views = boards
+        if kind == "good_parts":
+            most_parts = max(most_parts, _number(reference, "parts") or 0)
+    return views + most_parts
 
 
 def _number(data: Any, path: str) -> int | None:

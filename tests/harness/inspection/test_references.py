@@ -32,7 +32,9 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_capture(folder / "now", NOW, pose((3.0, -2.0, 4.0), (4.0, -3.0)), seed=2)
     for number in range(4):
         part = MadePart(bend_mm=0.3 * (number - 2), rib_mm=0.15 * (number % 3 - 1))
-        T = pose((number - 2.0, 1.0, number), (number, -number))
+        # each lies somewhere else, and the last is upside down
+        roll_deg = (0.0, 15.0, -30.0, 175.0)[number]
+        T = pose((number - 2.0, 1.0, roll_deg), (number, -number))
         write_capture(folder / "good" / f"part{number}", part, T, seed=10 + number)
     return folder
 
