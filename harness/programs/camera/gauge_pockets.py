@@ -29,7 +29,7 @@ AROUND_MM = 2.5
 
 @dataclass(frozen=True)
 class PocketSignal:
-    """What a range image shows of a pocket."""
+    """The signal of a pocket in a range image."""
 
     pocket: SolidPocket
     share: float
@@ -46,7 +46,7 @@ class PocketSignal:
 
     @property
     def is_seen(self) -> bool:
-        """Whether it stands out."""
+        """True where it stands out."""
         return self.ratio >= SEEN
 
 
