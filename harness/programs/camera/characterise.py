@@ -105,7 +105,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         write_camera,
     )
     from harness.programs.camera.certificate import write_certificate
-    from harness.programs.camera.gauge_report import read_recording, write_reading
+    from harness.programs.camera.gauge_report import read_recording, write_pockets, write_reading
     from harness.programs.camera.measure import characteristics, read_still
     from harness.programs.camera.page import KNOWN, MEASURED, SIMULATED, beside, write_page
     from harness.programs.camera.spheres import run_spheres
@@ -162,6 +162,8 @@ def main(options: argparse.Namespace, command: str) -> int:
         facts_of_gauge,
     )
     print("simulating the captures from it ..", file=sys.stderr)
+    if by_gauge:
+        write_pockets(options, by_gauge, camera)
     twin = characteristics(simulated(camera, measured, options.albedo), poses)
     sources = {MEASURED: measured, SIMULATED: twin}
     known_camera = options.like

@@ -14,6 +14,14 @@ from detectors.averages.average import RECORDED, average
 from harness.inspection.arguments import opened_as, reading_of
 from harness.inspection.output import print_notes, print_warnings
 from harness.programs.camera.camera_file import Stated
+from harness.programs.camera.gauge_pockets import (
+    POCKETS,
+    SEEN,
+    PocketSignal,
+    answer_of_pockets,
+    pocket_rows,
+    pocket_signals,
+)
 from harness.programs.camera.gauge_pose import located
 from harness.programs.camera.gauge_range import (
     Blur,
@@ -40,7 +48,6 @@ from harness.stills.spheres import (
     NoFit,
     RangeImage,
     SphereFit,
-    correlated_pixels,
     fit_sphere,
     student,
 )
@@ -52,10 +59,10 @@ from harness.vocabulary.text import many, show
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from scenes.sensor.camera import AnyCamera
+
 WIDTH_10_90 = 2.563
 """Width of a Gaussian edge between 10 and 90 % of its step, in standard deviations."""
-SEEN = 5.0
-"""Signal over noise at which a pocket counts as seen."""
 WORST_SHOWN_MM = 10.0
 """Residual beyond which the colours end: the outline, where what lies behind is mixed in."""
 
@@ -107,6 +114,14 @@ class GaugeReading:
     spacings: tuple[SpacingRow, ...]
     """Their distances with those of the gauge."""
     figures: tuple[GaugeFigure, ...]
+    pockets: tuple[PocketSignal, ...]
+    """Pockets that have pixels."""
+    sharp_m: np.ndarray
+    """(h, w): range of the gauge without blur."""
+    seen_m: np.ndarray
+    """(h, w): the same with the fitted blur."""
+    frames: int
+    """Frames of the recording."""
     residual_mm: np.ndarray
     """(h, w): corrected range minus that of the gauge with the fitted blur."""
     warnings: tuple[str, ...]
@@ -192,11 +207,12 @@ def measured(
         rows.append(SphereRow(name, number, recorded, name=ball.name))
     pairs = _with_truth(gauge, spacings(rows))
     seen_m = blurred(sharp_m, blur.blur_px if blur else 0.0)
+    signals = tuple(pocket_signals(straight, gauge, fit.T_camera_gauge, seen_m))
     figures = [
         *_of_range(fit),
         *_of_edges(blur),
         *_of_surfaces(cloud, straight, gauge, fit),
-        *_of_pockets(straight, gauge, fit, seen_m),
+        *_of_pockets(signals),
     ]
     if fit.birge > 2:
         warnings.append(
@@ -211,6 +227,10 @@ def measured(
         spheres=tuple(rows),
         spacings=tuple(pairs),
         figures=tuple(figures),
+        pockets=signals,
+        sharp_m=sharp_m,
+        seen_m=seen_m,
+        frames=cloud.n_frames,
         residual_mm=(straight.range_m - seen_m) / MM,
         warnings=tuple(warnings),
         notes=(),
@@ -283,42 +303,16 @@ def _of_surfaces(
     yield GaugeFigure("fixed pattern", "levels", "mm", Estimate(pattern_mm), meaning)
 
 
-def _of_pockets(
-    straight: RangeImage, gauge: SolidGauge, fit: RangeFit, seen_m: np.ndarray
-) -> Iterator[GaugeFigure]:
-    """Yield how much of each pocket's expected depth is measured: 1 for a camera that has but the
-    blur of its edges; and the signal over noise."""
-    normal = rotate_vectors(fit.T_camera_gauge, np.array([0.0, 0.0, 1.0]))
-    origin_m = fit.T_camera_gauge[:3, 3]
-    face_m = (normal @ origin_m) / (straight.rays @ normal)
-    expected_m = seen_m - face_m
-    off_m = straight.range_m - face_m
-    for pocket in gauge.pockets:
-        centre_m = transform_points(
-            fit.T_camera_gauge, np.array([pocket.x_mm, pocket.y_mm, 0.0]) * MM
-        )
-        points_m = straight.rays * face_m[..., None]
-        away_m = np.linalg.norm(points_m - centre_m, axis=-1)
-        near = (away_m < (pocket.diameter_mm / 2 + 2.5) * gauge.width_mm / 180 * MM) & np.isfinite(
-            off_m
-        )
-        template = expected_m[near]
-        power_m2 = float((template**2).sum())
-        if near.sum() < 9 or not np.isfinite(power_m2) or power_m2 == 0:
-            continue
-        design = np.column_stack([template, np.ones(len(template))])
-        (share, level_m), *_ = np.linalg.lstsq(design, off_m[near], rcond=None)
-        left_m = off_m[near] - design @ (share, level_m)
-        common = correlated_pixels(off_m.shape, np.flatnonzero(near.ravel()), left_m, numbers=2)
-        degrees = max(len(left_m) - 2 * common, 1.0)
-        variance_m2 = float((left_m**2).sum()) / degrees * common
-        sigma = float(np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * variance_m2))
-        half = student(degrees) * sigma
-        value = Estimate(float(share), float(share) - half, float(share) + half)
-        yield GaugeFigure("depth seen", pocket.name, "1", value, "share of its expected depth")
-        ratio = Estimate(float(share) / max(sigma, 1e-9))
+def _of_pockets(signals: Sequence[PocketSignal]) -> Iterator[GaugeFigure]:
+    """Yield how much of each pocket's expected depth is measured, and the signal over noise."""
+    for signal in signals:
+        half = student(signal.degrees) * signal.sigma
+        value = Estimate(signal.share, signal.share - half, signal.share + half)
+        where = signal.pocket.name
+        yield GaugeFigure("depth seen", where, "1", value, "share of its expected depth")
         meaning = f"that share over its standard error; from {SEEN:g} on it counts as seen"
-        yield GaugeFigure("signal over noise", pocket.name, "1", ratio, meaning)
+        ratio = Estimate(signal.ratio)
+        yield GaugeFigure("signal over noise", where, "1", ratio, meaning)
 
 
 # ---------------------------------------------------------------- output
@@ -371,6 +365,23 @@ def write_reading(options: argparse.Namespace, reading: GaugeReading, command: s
     }
     write_json(options.out / "gauge.json", facts)
     print(f"wrote {target} and the tables")
+
+
+def write_pockets(options: argparse.Namespace, reading: GaugeReading, camera: AnyCamera) -> None:
+    """Print and write which pockets are seen, beside how probably the camera sees each."""
+    sharp = replace(reading.image, range_m=reading.sharp_m)
+    rows = pocket_rows(
+        camera,
+        reading.gauge,
+        reading.pockets,
+        T_camera_gauge=reading.fit.T_camera_gauge,
+        view=(sharp, reading.seen_m),
+        frames=reading.frames,
+        albedo=options.albedo,
+    )
+    show([POCKETS.grid(rows, terminal=True)])
+    print(answer_of_pockets(rows))
+    write_table(options.out, POCKETS, POCKETS.frame(rows))
 
 
 def _residual_picture(reading: GaugeReading) -> str:

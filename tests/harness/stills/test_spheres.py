@@ -85,6 +85,20 @@ def test_a_far_sphere_in_the_sun_is_measured_with_a_wide_interval():
     assert held >= found - 1
 
 
+def test_half_a_sphere_on_a_wall_needs_more_evidence_than_one_alone():
+    """What stands alone is searched for at few places of an image."""
+    centre_m = np.array([[0.05, 0.02, 3.5]])
+    fitted = []
+    for wall_m in (3.5, 5.0):
+        fits = []
+        for seed in range(16):
+            image = sphere_scene(centre_m, RADIUS_M, 12e-3, 0.5, seed, lens=FAR, wall_m=wall_m)
+            fits.append(fit_sphere(image, centre_m[0], RADIUS_M))
+        fitted.append(sum(isinstance(fit, SphereFit) for fit in fits))
+    assert fitted[0] <= 5
+    assert fitted[1] >= 10
+
+
 def test_a_round_plate_that_stands_alone_is_no_sphere():
     plate_m = sphere_scene(CENTRES_M[:0], RADIUS_M, lens=FAR, wall_m=5.0)
     for seed in range(4):

@@ -53,7 +53,9 @@ def test_a_wrong_camera_is_recovered_within_its_intervals(tmp_path: Path, name: 
 def test_one_recording_gives_all_files(tmp_path: Path, capsys):
     arguments = recorded(tmp_path, bias_mm=5.0, blur_px=0.6)
     assert characterise.main(arguments) == 0
-    assert "mm in bias" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "mm in bias" in printed
+    assert "of 21 pockets are seen; the camera file expects" in printed
     out = tmp_path / "out"
     camera = read_camera(out / "my_camera.yaml")
     assert camera.range_error.bias_mm.value == pytest.approx(5, abs=1.5)
@@ -69,6 +71,11 @@ def test_one_recording_gives_all_files(tmp_path: Path, capsys):
     assert figures["depth seen", "pocket 12 x 4"] == pytest.approx(1, abs=0.1)
     assert figures["signal over noise", "pocket 12 x 4"] > 10
     assert figures["signal over noise", "pocket 2 x 1"] < 5
+    pockets = pd.read_csv(out / "pockets.csv").set_index("pocket")
+    assert pockets.loc["pocket 12 x 4", ["simulated", "simulated_high"]].tolist() == [1, 1]
+    assert pockets.loc["pocket 2 x 1", ["simulated_low", "simulated"]].tolist() == [0, 0]
+    assert pockets.seen.sum() == pytest.approx(pockets.simulated.sum(), abs=3)
+    assert (pockets.ratio >= 5).tolist() == pockets.seen.tolist()
     stored = json.loads((out / "gauge.json").read_text())
     assert np.array(stored["T_camera_gauge"]) == pytest.approx(pose(), abs=2e-3)
 

@@ -11,6 +11,8 @@ import pandas as pd
 import pytest
 
 from harness.programs.camera import characterise
+from harness.programs.camera.spheres import SphereRow, spacings
+from harness.stills.spheres import SphereFit, fit_sphere
 from harness.vocabulary.geometry import MM
 from tests.support.spheres import LENS, sphere_scene
 
@@ -48,6 +50,22 @@ def test_spheres_of_a_capture(tmp_path: Path, capsys):
     assert "VDI/VDE 2634-2" in page
     stored = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert len(stored["spheres"]) == 2
+
+
+def test_a_spacing_is_as_uncertain_as_both_centres():
+    rows = []
+    for number, sigma_m in enumerate((1e-3, 3e-3)):
+        image = sphere_scene(CENTRES_M, RADIUS_M, sigma_m, seed=number)
+        fit = fit_sphere(image, CENTRES_M[number], RADIUS_M)
+        assert isinstance(fit, SphereFit)
+        rows.append(SphereRow("capture", number, fit))
+    (pair,) = spacings(rows)
+    apart_m = rows[1].fit.centre_m - rows[0].fit.centre_m
+    direction = apart_m / np.linalg.norm(apart_m)
+    variances_m2 = [direction @ row.fit.covariance_m2 @ direction for row in rows]
+    half_mm = 1.96 * np.sqrt(sum(variances_m2)) / MM
+    assert pair.measured_mm.value == pytest.approx(np.linalg.norm(apart_m) / MM)
+    assert pair.measured_mm.high - pair.measured_mm.value == pytest.approx(half_mm, rel=0.02)
 
 
 @pytest.mark.parametrize(
