@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from harness.vocabulary.system import has_nvidia_driver
 from scenes.render.cache import read_view
-from scenes.render.scene import _has_nvidia_driver
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = """
@@ -35,7 +35,7 @@ cached_view(job.target, camera_of(job.camera).optics, job.config, job.folder)
 """
 
 
-@pytest.mark.skipif(not _has_nvidia_driver(), reason="no NVIDIA GPU")
+@pytest.mark.skipif(not has_nvidia_driver(), reason="no NVIDIA GPU")
 def test_a_gpu_renders_the_same_view(tmp_path):
     views = []
     for variant in ("cuda_ad_mono", "llvm_ad_mono"):
