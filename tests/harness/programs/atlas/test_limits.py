@@ -149,6 +149,16 @@ def sites(stream: np.random.Generator, offsets: np.ndarray) -> Sites:
     )
 
 
+def test_an_error_is_never_below_what_its_departures_can_tell():
+    """Departures all but equal to the law leave their own chance, by the scatter of a variance."""
+    law, departures = fitted(sites(np.random.default_rng(5), np.zeros(12)), {})
+    between = np.array([one.deviation for one in departures[1:-1]])
+    excess = np.array([one.log_signal for one in departures[1:-1]]) ** 2 - between**2
+    least = (between**2).mean() * np.sqrt(2 / len(between))
+    assert excess.mean() < 0
+    assert law.error == pytest.approx(np.sqrt(least))
+
+
 def test_the_error_is_that_of_distances_left_out():
     """Set-ups that depart by nothing but chance have none; others what they depart by."""
     stream = np.random.default_rng(3)
