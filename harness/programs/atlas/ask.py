@@ -27,6 +27,10 @@ KINDS = ("through", "blind", "dent", "slot", "gouge")
 SIZE_OF = {"slot": "width"}
 """What a size is of; of all others, the diameter."""
 ALBEDO = 0.6
+MOST_WARNINGS = 2
+"""Most warnings about single cameras."""
+GUESSED_FACTORS = re.compile(r"may be ([\d.]+) to ([\d.]+) times")
+"""What a camera's warning says of its noise (`scenes.sensor.camera.guessed_precision`)."""
 SCRATCH = (
     "A scratch (gouge) is answered as a slot of that width and depth; one with a V-shaped section"
     " is shallower on average, so that its limit is larger."
@@ -362,18 +366,22 @@ def _deep_enough(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def _warnings(shards: Any) -> list[str]:
-    """Return the warnings about cameras whose precision is a guess, one for equal guesses."""
-    titles_by_form: dict[str, list[str]] = {}
-    for shard in shards:
-        title = shard.titles[shard.camera]
-        if shard.warning:
-            titles_by_form.setdefault(shard.warning.replace(title, "{}"), []).append(title)
-    warnings = []
-    for form, titles in titles_by_form.items():
-        several = form.replace("its noise", "their noise") if len(titles) > 1 else form
-        warnings.append(several.format("; ".join(titles)))
-    return warnings
+def _warnings(shards: Iterable[CameraLimits]) -> list[str]:
+    """Return the warnings about cameras whose precision is a guess: of two cameras one each, of
+    more a single one, so that the answer stands on the first screen."""
+    guessed = [shard for shard in shards if shard.warning]
+    if len(guessed) <= MOST_WARNINGS:
+        return [shard.warning for shard in guessed]
+    factors: list[float] = []
+    for shard in guessed:
+        stated = GUESSED_FACTORS.search(shard.warning)
+        if stated is not None:
+            factors += [float(factor) for factor in stated.groups()]
+    titles = "; ".join(shard.titles[shard.camera] for shard in guessed)
+    return [
+        f"the precision of {len(guessed)} cameras is not published, or only roughly: their noise is"
+        f" a guess, which may be {min(factors):g} to {max(factors):g} times as much ({titles})"
+    ]
 
 
 def _same(shards: Any) -> list[str]:

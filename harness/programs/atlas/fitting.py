@@ -8,7 +8,8 @@ only that it is above, as `harness.evaluation.study.signals` explains. Threshold
 each, differ from set-up to set-up by chance; the law is that of the camera's middle one.
 
 The prior is the ideal detector's law. The stated error is how far distances that were left out
-depart from the law of the others, less the chance of their own damage. Not modelled: damage of
+depart from the law of the others, less the chance of their own damage, and never less than that
+chance hides. Not modelled: damage of
 one board has the same noise, which that error contains."""
 
 from collections.abc import Mapping
@@ -110,8 +111,12 @@ def fitted(sites: Sites, ranges: Mapping[str, tuple[float, float]]) -> tuple[Law
     telling = [one for one in between if one.deviation <= TELLING]
     error = np.nan
     if len(telling) >= LEAST_TELLING:
-        excess = [one.log_signal**2 - one.deviation**2 for one in telling]
-        error = max(float(np.mean(excess)), 0.0) ** 0.5
+        by_chance = np.array([one.deviation**2 for one in telling])
+        excess = np.array([one.log_signal**2 for one in telling]) - by_chance
+        # the mean of n squares of normal departures varies by sqrt(2 / n) of itself: less than
+        # that is not seen
+        least = np.sqrt(2 / len(telling)) * by_chance.mean()
+        error = float(np.sqrt(max(excess.mean(), least)))
     values = _most_likely(sites, ends)
     law = Law(
         coefficients=values[:-1],

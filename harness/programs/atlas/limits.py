@@ -143,8 +143,13 @@ class Answer:
 
     @cached_property
     def low_mm(self) -> float:
-        """Lower end of its 95 % interval; 0 below the sizes inspected, infinite above them."""
-        return self._first(self.middle + self.half)
+        """Lower end of its 95 % interval, infinite above the sizes inspected. Below them signals
+        fall at least in proportion to the size, as those of an ideal filter do (of what is
+        narrower than a pixel, with its square): the end is the smallest that this allows."""
+        highest = self.middle + self.half
+        if highest[0] >= 0:
+            return float(self.sizes_mm[0] * np.exp(-highest[0]))
+        return self._first(highest)
 
     @cached_property
     def high_mm(self) -> float:
@@ -188,9 +193,11 @@ class Answer:
         is_smaller = size_mm < self.sizes_mm[0] * (1 - TOLERANCE)
         if is_larger and not self.grows:
             return "undecided"
+        log_size = np.log(size_mm)
         log_sizes = np.log(self.sizes_mm)
-        middle = np.interp(np.log(size_mm), log_sizes, self.middle)
-        half = np.interp(np.log(size_mm), log_sizes, self.half)
+        middle = np.interp(log_size, log_sizes, self.middle)
+        middle -= max(log_sizes[0] - log_size, 0.0)  # at least so much lower, as in `low_mm`
+        half = np.interp(log_size, log_sizes, self.half)
         if middle - half >= 0 and not is_smaller:
             return "yes"
         return "no" if middle + half < 0 and not is_larger else "undecided"

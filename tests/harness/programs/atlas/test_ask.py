@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from harness.programs.atlas.ask import main
+from harness.programs.atlas.ask import _warnings, main
 from harness.programs.atlas.limits import Conditions
 from harness.programs.atlas.stored import read_atlas
 from tests.support.browser import opened
@@ -180,6 +181,23 @@ def test_a_refusal_states_the_sweep_that_answers(atlas: Path, capsys: pytest.Cap
     assert main(["--distance", "2.9m", "--camera", "dim", "--atlas", str(atlas)]) == 2
     error = capsys.readouterr().err
     assert "compute it: tofpod sweep atlas" in error and "source.target.distance_m=2.9" in error
+
+
+def test_guessed_precisions_of_many_cameras_are_one_warning(atlas: Path):
+    """With the least and the greatest factor, and every camera's title."""
+    ends = (("0.5", "2"), ("0.71", "1.4"), ("0.6", "3"))
+    dim, sharp = read_atlas(atlas)
+    guessed = []
+    for known, (least, greatest) in zip((dim, sharp, dim), ends, strict=True):
+        title = known.titles[known.camera]
+        guess = f"its noise is a guess, which may be {least} to {greatest} times as much"
+        guessed.append(
+            replace(known, warning=f"the precision of {title} is not published: {guess}")
+        )
+    (together,) = _warnings(guessed)
+    assert "3 cameras" in together and "may be 0.5 to 3 times as much" in together
+    assert all(camera.titles[camera.camera] in together for camera in guessed)
+    assert _warnings(guessed[1:]) == [camera.warning for camera in guessed[1:]]
 
 
 def test_an_own_camera_is_answered_by_the_camera_of_its_numbers(

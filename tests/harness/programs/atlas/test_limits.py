@@ -149,6 +149,16 @@ def sites(stream: np.random.Generator, offsets: np.ndarray) -> Sites:
     )
 
 
+def test_an_error_is_never_below_what_its_departures_can_tell():
+    """Departures all but equal to the law leave their own chance, by the scatter of a variance."""
+    law, departures = fitted(sites(np.random.default_rng(5), np.zeros(12)), {})
+    between = np.array([one.deviation for one in departures[1:-1]])
+    excess = np.array([one.log_signal for one in departures[1:-1]]) ** 2 - between**2
+    least = (between**2).mean() * np.sqrt(2 / len(between))
+    assert excess.mean() < 0
+    assert law.error == pytest.approx(np.sqrt(least))
+
+
 def test_the_error_is_that_of_distances_left_out():
     """Set-ups that depart by nothing but chance have none; others what they depart by."""
     stream = np.random.default_rng(3)
@@ -212,7 +222,7 @@ def answer_of(middle: list[float], half: float, *, grows: bool = True) -> Answer
         # (low, a90, high), and verdicts on 0.5, 1.5, 2, 5, 9 mm
         ([-2, -1, 1, 2], (2.0 * 2**0.25, 2.83, 2.0 * 2**0.75), "no no no yes yes"),
         ([-3, -3, -2, -1], (math.inf, math.nan, math.inf), "no no no no undecided"),
-        ([1, 2, 3, 4], (0.0, math.nan, 1.0), "undecided yes yes yes yes"),
+        ([1, 2, 3, 4], (math.exp(-1.5), math.nan, 1.0), "undecided yes yes yes yes"),
         ([-2, -1, 0.2, 0.3], (2.67, 3.56, math.inf), "no no no undecided undecided"),
     ],
 )
@@ -224,6 +234,13 @@ def test_a_limit_and_its_verdicts(
     assert ends == pytest.approx(limit, rel=0.02, nan_ok=True)
     said = [answer.verdict(size_mm) for size_mm in (0.5, 1.5, 2.0, 5.0, 9.0)]
     assert said == verdicts.split()
+
+
+def test_what_is_much_smaller_than_inspected_is_not_found():
+    """At half of the size that the lower end is, and just above it."""
+    answer = answer_of([1, 2, 3, 4], 0.5)
+    assert answer.verdict(0.5 * answer.low_mm) == "no"
+    assert answer.verdict(1.01 * answer.low_mm) == "undecided"
 
 
 def test_a_wide_dent_is_harder_again():
