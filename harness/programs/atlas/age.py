@@ -10,6 +10,8 @@ from harness.vocabulary.text import joined_words
 FOLDERS = ("detectors", "scenes", "harness/trials", "harness/evaluation", "harness/experiment")
 """Folders whose sources decide limits, with `harness/runs` and `harness/vocabulary`."""
 ALSO = ("harness/runs", "harness/vocabulary")
+LAW = ("harness/programs/atlas/fitting.py", "harness/programs/atlas/law.py")
+"""Sources that decide the law that is fitted to signals."""
 NOT_CODE = "experiment "
 """Begins the name of a digest of settings: an atlas of other settings is not older."""
 
@@ -18,12 +20,14 @@ def sources_digest() -> str:
     """Return a digest of the bytes of all sources and camera files that may decide a limit. While
     it is the same, so are all digests by part, which take a second of processor time."""
     state = hashlib.blake2b(digest_size=8)
+    paths = [ROOT / name for name in LAW]
     for folder in (*FOLDERS, *ALSO):
-        for path in sorted((ROOT / folder).rglob("*")):
-            if path.suffix in (".py", ".yaml", ".npz"):
-                content = path.read_bytes()
-                state.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
-                state.update(content)
+        paths += sorted((ROOT / folder).rglob("*"))
+    for path in paths:
+        if path.suffix in (".py", ".yaml", ".npz"):
+            content = path.read_bytes()
+            state.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
+            state.update(content)
     return state.hexdigest()
 
 
@@ -53,7 +57,7 @@ def _changed_parts(camera: str, about: Mapping[str, Any]) -> list[str]:
     as one; the whole project where none are stored."""
     from detectors import detector_names
     from harness.experiment.digests import CAMERA_PART, simulation_digests
-    from harness.vocabulary.code_digests import changed_parts
+    from harness.vocabulary.code_digests import changed_parts, file_digests
     from scenes.sensor.camera import camera_names
 
     stored = about.get("digests")
@@ -64,7 +68,7 @@ def _changed_parts(camera: str, about: Mapping[str, Any]) -> list[str]:
     if not cameras:  # a camera of the user's own, whose file may be elsewhere by now
         code_parts = {k: v for k, v in code_parts.items() if not k.startswith(CAMERA_PART)}
     detectors = [name for name in [about.get("detector")] if name in detector_names()]
-    today = simulation_digests(detectors, cameras)
+    today = simulation_digests(detectors, cameras) | file_digests(LAW)
     rooms = []
     for part in changed_parts(code_parts, today):
         rooms.append("cameras" if part.startswith(CAMERA_PART) else part.partition("/")[0])

@@ -13,7 +13,7 @@ from detectors import detector_type
 from harness.experiment.digests import experiment_digests
 from harness.experiment.load import load_experiment, resolved_yaml
 from harness.experiment.schema import Experiment
-from harness.programs.atlas.age import sources_digest
+from harness.programs.atlas.age import LAW, sources_digest
 from harness.programs.atlas.fitting import Sites, fitted
 from harness.programs.atlas.limits import FailedSetUp, PlaneNoise
 from harness.programs.atlas.parts import DEPTHS_MM, EXPERIMENT, Part
@@ -29,7 +29,7 @@ from harness.runs.plan import plan_of
 from harness.runs.run import run_plan
 from harness.runs.shards import locked
 from harness.runs.tables import tables_of
-from harness.vocabulary.code_digests import Digests
+from harness.vocabulary.code_digests import Digests, file_digests
 from harness.vocabulary.errors import DiskFull, UserError
 from harness.vocabulary.files import write_json, write_text
 from harness.vocabulary.provenance import RESULTS_VERSION, record
@@ -80,7 +80,7 @@ class Planned:
                 load_experiment(Path(EXPERIMENT), [f"source.camera.name={self.camera}"])
             )
         parts = [experiment_digests(experiment) for experiment in self.experiments]
-        digests = dict(parts[0])
+        digests = parts[0] | file_digests(LAW)
         digests[OF_A_PART] = digest([part[OF_A_PART] for part in parts])
         return digests
 
