@@ -18,6 +18,7 @@ from detectors.sources.interface import (
     Stream,
     camera_errors,
     load_sdk,
+    refuse_recording,
     stated_lens,
     stream_of,
     without_frames,
@@ -32,9 +33,7 @@ INSTALL = "pip install --no-deps pyorbbecsdk2, as it asks for an older NumPy tha
 @contextmanager
 def open_femto(path: Path | None) -> Iterator[Stream]:
     """Start the first camera with its default depth and infrared."""
-    if path is not None:
-        fix = "leave --camera out: tofpod reads .mkv and bags itself"
-        raise UserError(f"--from {path}: the camera {CAMERA} plays no recording", fix=fix)
+    refuse_recording(CAMERA, path, ".mkv and bags")
     sdk = load_sdk("pyorbbecsdk", CAMERA, INSTALL)
     with camera_errors(CAMERA):
         pipeline = sdk.Pipeline()

@@ -71,6 +71,14 @@ def without_frames(camera: str) -> UserError:
     return UserError(f"camera {camera}: no frame came for {PATIENCE_S} s", fix=fix)
 
 
+def refuse_recording(camera: str, path: Path | None, readable: str) -> None:
+    """Raise UserError if a recording is named for a camera whose package plays none. ``readable``:
+    what tofpod reads itself."""
+    if path is not None:
+        fix = f"leave --camera out: tofpod reads {readable} itself"
+        raise UserError(f"--from {path}: the camera {camera} plays no recording", fix=fix)
+
+
 def stated_lens(
     camera: str, shape: tuple[int, ...], matrix: np.ndarray, distortion: Sequence[float] = ()
 ) -> Lens:

@@ -22,6 +22,7 @@ from detectors.sources.interface import (
     Stream,
     camera_errors,
     load_sdk,
+    refuse_recording,
     stated_lens,
     stream_of,
     without_frames,
@@ -36,9 +37,7 @@ INSTALL = "pip install 'tofpod[oak]'"
 @contextmanager
 def open_oak(path: Path | None) -> Iterator[Stream]:
     """Start the first camera's time-of-flight sensor with the profile of middle ranges."""
-    if path is not None:
-        fix = "leave --camera out: tofpod reads bags itself"
-        raise UserError(f"--from {path}: the camera {CAMERA} plays no recording", fix=fix)
+    refuse_recording(CAMERA, path, "bags")
     dai = load_sdk("depthai", CAMERA, INSTALL)
     with camera_errors(CAMERA):
         pipeline = dai.Pipeline()
