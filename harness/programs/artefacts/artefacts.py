@@ -36,11 +36,12 @@ def main(options: argparse.Namespace, command: str) -> int:
     Ctrl-C."""
     from harness.programs.artefacts.declaration import declared_artefacts, refuse_without_checkout
     from harness.programs.artefacts.ledger import entry_now, read_ledger, store_entry
-    from harness.programs.artefacts.making import make_all
+    from harness.programs.artefacts.making import make_all, store_files
     from harness.programs.artefacts.quoted import write_quotations
 
     refuse_without_checkout()
     for name in options.made:
+        store_files(name)
         entry = entry_now(name, None)
         store_entry(name, entry)
     failed = []

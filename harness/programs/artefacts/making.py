@@ -82,14 +82,24 @@ def _expected_s(name: str, ledger: Ledger) -> float:
 
 
 def _make(name: str, *, quick: bool) -> None:
-    """Run an artefact's commands and store its files. Raises UserError if something that it needs
-    is absent, or if a command fails."""
+    """Run an artefact's commands, and store what they have made. Raises UserError if something
+    that it needs is absent, or if a command fails."""
     artefact = artefact_named(name)
     for needed in artefact.needs:
         if shutil.which(needed) is None and not (provenance.ROOT / needed).exists():
             raise UserError(f"needs {needed}, which is not here")
     for command in artefact.commands:
         _run(command, quick=quick)
+    store_files(name)
+
+
+def store_files(name: str) -> None:
+    """Store the files of an artefact and the data of its table, from the results that its commands,
+    or a person, have made. Raises UserError if one is absent or lacks a column."""
+    artefact = artefact_named(name)
+    for file in (*artefact.stores.values(), *artefact.rows):
+        if not (provenance.ROOT / file).exists():
+            raise UserError(f"{name}: {file} is absent", fix=f"run {'; '.join(artefact.commands)}")
     for file, source in artefact.stores.items():
         content = (provenance.ROOT / source).read_bytes()
         write_bytes(provenance.ROOT / file, content)

@@ -130,7 +130,7 @@ def read_rows(name: str) -> list[Row]:
 
 def stored_rows(table: QuotedTable, sources: Iterable[str]) -> str:
     """Return the data of a table as CSV: the columns that it names, from tables of results. The
-    column ``experiment`` names the experiment of each. Raises UserError if a column is missing."""
+    column ``experiment`` names the experiment of each, where a table has none. Raises UserError if a column is missing."""
     columns = list(dict.fromkeys(_columns(table)))
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
@@ -139,7 +139,7 @@ def stored_rows(table: QuotedTable, sources: Iterable[str]) -> str:
         path = provenance.ROOT / source
         with path.open(encoding="utf-8-sig", newline="") as lines:
             for row in csv.DictReader(lines):
-                row["experiment"] = path.parent.parent.name
+                row.setdefault("experiment", path.parent.parent.name)
                 missing = [column for column in columns if column not in row]
                 if missing:
                     raise UserError(f"{source}: has no column {', '.join(missing)}")

@@ -39,6 +39,11 @@ artefacts:
     about: what a person measured
     documents: [docs/page.md]
     by_hand: true
+    commands: ['python measure.py']
+    rows: [results/times/times.csv]
+    table:
+      labels: {experiment: "{experiment}"}
+      cells: {seconds: "{seconds:.1f}"}
     inputs: [code.py]
 """
 MAKE = """
@@ -67,6 +72,9 @@ The end.
 TABLE = """| camera | damage | beside | after | a90, frames: 1 | a90, frames: 50 |
 |---|---|---|---|---|---|
 | Kinect v2 | blind | 5 good parts | flat board | 4.0 mm | none |"""
+MEASURED = """| experiment | seconds |
+|---|---|
+| averaging | 12.3 |"""
 CACHED = (
     declaration.declared_artefacts,
     declaration._command_digests,
@@ -90,6 +98,13 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     forget()
     yield tmp_path
     forget()
+
+
+def measure_by_hand(checkout: Path) -> None:
+    """As a person does."""
+    times = checkout / "results/times/times.csv"
+    times.parent.mkdir(parents=True)
+    times.write_text("experiment,seconds,load\naveraging,12.34,1\n")
 
 
 def forget() -> None:
@@ -130,8 +145,9 @@ def test_what_is_current_is_not_made_again(checkout: Path, capsys: pytest.Captur
 
 def test_a_change_of_code_is_said_and_then_repaired(checkout: Path):
     run()
+    measure_by_hand(checkout)
     run("--made", "person")
-    assert page(checkout)["person"] == ""
+    assert page(checkout)["person"] == MEASURED
     (checkout / "code.py").write_text("K = 2\n")
     run("--ages")
     assert times_made(checkout) == 1
@@ -155,6 +171,19 @@ def test_one_alone(checkout: Path, capsys: pytest.CaptureFixture[str]):
     assert "did you mean 'numbers'?" in capsys.readouterr().err
     run("--only", "person", code=2)
     assert "person: is made by hand" in capsys.readouterr().err
+
+
+def test_what_a_person_measured_is_stored(checkout: Path, capsys: pytest.CaptureFixture[str]):
+    run("--made", "person", code=2)
+    error = capsys.readouterr().err
+    assert "person: results/times/times.csv is absent" in error
+    assert "python measure.py" in error
+    assert not (checkout / "artefacts.json").exists()
+    measure_by_hand(checkout)
+    run("--made", "person")
+    assert page(checkout)["person"] == MEASURED
+    stored = (checkout / "results/baselines/tables/person.csv").read_text()
+    assert stored == "experiment,seconds\naveraging,12.34\n"
 
 
 def test_a_file_that_was_edited_is_made_again(checkout: Path):
