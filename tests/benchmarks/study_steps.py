@@ -144,7 +144,7 @@ def frames(runs: int) -> Iterator[StepRow]:
         for camera in CAMERAS:
             trial = trials_of(Path(folder), 1, f"source.camera.name={camera}")[0]
             unit = load_board(trial.views[0]).unit
-            
+
             def draw(unit: Any = unit) -> None:
                 for _ in unit.capture(50, 1).frames():
                     pass

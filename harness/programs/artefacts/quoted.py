@@ -130,7 +130,8 @@ def read_rows(name: str) -> list[Row]:
 
 def stored_rows(table: QuotedTable, sources: Iterable[str]) -> str:
     """Return the data of a table as CSV: the columns that it names, from tables of results. The
-    column ``experiment`` names the experiment of each, where a table has none. Raises UserError if a column is missing."""
+    column ``experiment`` names the experiment of each, where a table has none. Raises UserError if
+    a column is missing."""
     columns = list(dict.fromkeys(_columns(table)))
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
