@@ -29,8 +29,8 @@ from detectors.pixels.clusters import PLAIN, root_of
 from detectors.pixels.masks import outline_depth_px
 from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
 from detectors.score_map import Findings, above, on_grid
-from detectors.surfaces.background import Background
-from detectors.surfaces.shared import shared_background
+from detectors.surfaces.background import Background, background
+from detectors.surfaces.shared import shared
 from detectors.surfaces.smooth_surfaces import raster
 from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.config import Config
@@ -140,7 +140,7 @@ class LocalDetector:
         For an organised cloud, they are the means over squares of ``pixels`` a side. Raises
         UserError on an empty crop, or if no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
-        ground = shared_background(cloud, mask, self.settings.surface)
+        ground = shared(background, cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
         if cloud.organised:
             rows, columns = np.nonzero(judged)
