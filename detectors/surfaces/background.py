@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from detectors.pixels.masks import grown, on_grid
-from detectors.pixels.medians import group_medians
+from detectors.pixels.medians import group_medians, row_medians
 from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
@@ -349,9 +349,8 @@ def _noise_of_points(cells: _Cells) -> np.ndarray:
     windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))
     around = windows[cells.row, cells.column].reshape(-1, 49)
     pixel = cells.pixel_noise
-    is_known = np.isfinite(around).any(axis=1)
-    local = np.full(len(around), pixel)
-    local[is_known] = np.hypot(np.nanmedian(around[is_known], axis=1), cells.level_noise)
+    medians = row_medians(around)
+    local = np.where(np.isfinite(medians), np.hypot(medians, cells.level_noise), pixel)
     of_cells = np.where(local > NOISIER * pixel, local, pixel)
     return np.where(cells.cell_of_point >= 0, of_cells[cells.cell_of_point], pixel)
 
