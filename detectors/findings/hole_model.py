@@ -510,9 +510,11 @@ def _drawn(  # type: ignore[no-untyped-def]
     if shape != DISC or not (brightness > 0.0 or half < np.inf):
         return images
     sharp = _averaged(shape, holes, sights, metric, 1.0, 1.0, False, lens, h, w)
-    mouths = holes.copy()
-    mouths[:, 3] = -1.0
-    faces = 1.0 + _averaged(shape, mouths, sights, metric, blur_u, blur_v, soft, lens, h, w)
+    faces = sharp  # what is seen of the face matters only where light weighs
+    if brightness > 0.0:
+        mouths = holes.copy()
+        mouths[:, 3] = -1.0
+        faces = 1.0 + _averaged(shape, mouths, sights, metric, blur_u, blur_v, soft, lens, h, w)
     for n in range(len(images)):
         if holes[n, 3] > 0.0:
             _weigh(images[n], sharp[n], faces[n], holes[n, 3], brightness, half)
@@ -542,13 +544,11 @@ def _averaged(  # type: ignore[no-untyped-def]
         images = reliefs(shape, holes, sights, metric, max(blur_u, 1.0), max(blur_v, 1.0), h, w)
     if soft:
         for n in range(len(images)):
-            _smooth_rows(images[n], blur_u)
-            _smooth_rows(images[n].T, blur_v)
+            _smooth(images[n], blur_u, blur_v)
     lens_u, lens_v = lens
     if lens_u > 1.0 or lens_v > 1.0:
         for n in range(len(images)):
-            _smooth_rows(images[n], lens_u)
-            _smooth_rows(images[n].T, lens_v)
+            _smooth(images[n], lens_u, lens_v)
     return images
 
 
@@ -583,24 +583,75 @@ def _weigh(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(**PLAIN)
-def _smooth_rows(image, side):  # type: ignore[no-untyped-def]
-    """Replace each row of an image (h, w) by its means over ``side`` pixels. Beyond its ends, the
-    image goes on as its last pixel."""
+def _smooth(image, side_u, side_v):  # type: ignore[no-untyped-def]
+    """Replace an image (h, w) by its means over rectangles of ``side_u`` x ``side_v`` pixels.
+    Beyond its edges, the image goes on as its last pixels. Most of it is 0 and stays so."""
+    top, bottom, left, right = _extent(image)
+    if bottom == 0:
+        return
+    margin_u = math.ceil(0.5 * side_u) + 1
+    margin_v = math.ceil(0.5 * side_v) + 1
+    first_row = max(top - margin_v, 0)
+    first_column = max(left - margin_u, 0)
+    window = image[first_row : bottom + margin_v, first_column : right + margin_u]
+    turned = window.T.copy()
+    _smooth_columns(turned, side_u, first_column)
+    window[:] = turned.T
+    _smooth_columns(window, side_v, first_row)
+
+
+@numba.njit(**PLAIN)
+def _extent(image):  # type: ignore[no-untyped-def]
+    """Return the first row and column of an image (h, w) that hold a number but 0, and the ends
+    of such rows and columns: first row, end of rows, first column, end of columns."""
+    h, w = image.shape
+    top = h
+    bottom = 0
+    left = w
+    right = 0
+    for r in range(h):
+        first = 0
+        while first < w and image[r, first] == 0.0:
+            first += 1
+        if first == w:
+            continue
+        last = w - 1
+        while image[r, last] == 0.0:
+            last -= 1
+        top = min(top, r)
+        bottom = r + 1
+        left = min(left, first)
+        right = max(right, last + 1)
+    return top, bottom, left, right
+
+
+@numba.njit(**PLAIN)
+def _smooth_columns(image, side, first):  # type: ignore[no-untyped-def]
+    """Replace each column of an image (h, w) by its means over ``side`` pixels, all columns at
+    once: sums along rows would wait for one another. ``first``: the row of a larger picture at
+    which the image begins, so that parts of pixels are rounded as there."""
     h, w = image.shape
     margin = math.ceil(0.5 * side) + 1
-    sums = np.zeros(w + 2 * margin + 1)
-    for r in range(h):
-        for c in range(w + 2 * margin):
-            sums[c + 1] = sums[c] + image[r, min(max(c - margin, 0), w - 1)]
+    sums = np.zeros((h + 2 * margin + 1, w))
+    for r in range(h + 2 * margin):
+        pixels = image[min(max(r - margin, 0), h - 1)]
+        above = sums[r]
+        sum_row = sums[r + 1]
         for c in range(w):
-            middle = c + 0.5 + margin
-            low = middle - 0.5 * side
-            high = middle + 0.5 * side
-            i = int(low)
-            j = int(high)
-            before = sums[i] + (low - i) * (sums[i + 1] - sums[i])
-            after = sums[j] + (high - j) * (sums[j + 1] - sums[j])
-            image[r, c] = (after - before) / side
+            sum_row[c] = above[c] + pixels[c]
+    for r in range(h):
+        middle = first + r + 0.5 + margin
+        low = middle - 0.5 * side
+        high = middle + 0.5 * side
+        to_low = low - int(low)
+        to_high = high - int(high)
+        i = int(low) - first
+        j = int(high) - first
+        row = image[r]
+        for c in range(w):
+            before = sums[i, c] + to_low * (sums[i + 1, c] - sums[i, c])
+            after = sums[j, c] + to_high * (sums[j + 1, c] - sums[j, c])
+            row[c] = (after - before) / side
 
 
 @numba.njit(**PLAIN)

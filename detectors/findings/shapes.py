@@ -131,9 +131,14 @@ def reliefs(
         last_column = min(fine_w, math.ceil(finer * (u + reach_u + 0.5 + margin_u)))
         first_row = max(0, math.floor(finer * (v - reach_v + 0.5 + margin_v)))
         last_row = min(fine_h, math.ceil(finer * (v + reach_v + 0.5 + margin_v)))
+        # the pixels whose means reach the damage; all others are 0
+        left = max(0, math.floor(u - reach_u - 0.5 * blur_u) - 1)
+        right = min(w, math.ceil(u + reach_u + 0.5 * blur_u) + 2)
+        top_row = max(0, math.floor(v - reach_v - 0.5 * blur_v) - 1)
+        end_row = min(h, math.ceil(v + reach_v + 0.5 * blur_v) + 2)
         for i in range(fine_h):
             if i < first_row or i >= last_row or last_column <= first_column:
-                for c in range(w):
+                for c in range(left, right):
                     rows[i + 1, c] = rows[i, c]
                 continue
             dv = (i + 0.5) / finer - 0.5 - margin_v - v
@@ -164,13 +169,13 @@ def reliefs(
                 line[j + 1] = line[j] + total
             for j in range(last_column, fine_w):
                 line[j + 1] = line[j]
-            for c in range(w):
+            for c in range(left, right):
                 middle = finer * (c + 0.5 + margin_u)
                 low = _sum_before(line, middle - 0.5 * finer * blur_u)
                 high = _sum_before(line, middle + 0.5 * finer * blur_u)
                 rows[i + 1, c] = rows[i, c] + (high - low)
         per_points = 1.0 / (finer * finer * blur_u * blur_v)
-        for r in range(h):
+        for r in range(top_row, end_row):
             middle = finer * (r + 0.5 + margin_v)
             above = middle - 0.5 * finer * blur_v
             below = middle + 0.5 * finer * blur_v
@@ -178,7 +183,7 @@ def reliefs(
             bottom = int(below)
             to_top = above - top
             to_bottom = below - bottom
-            for c in range(w):
+            for c in range(left, right):
                 high = rows[bottom, c] + to_bottom * (rows[bottom + 1, c] - rows[bottom, c])
                 low = rows[top, c] + to_top * (rows[top + 1, c] - rows[top, c])
                 images[n, r, c] = per_points * (high - low)

@@ -28,9 +28,10 @@ from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.clusters import PLAIN, root_of
 from detectors.pixels.masks import outline_depth_px
 from detectors.pixels.noise import average_variance_m2, median_of, rounding_variances, sigma_of
+from detectors.pixels.ordering import falling_order
 from detectors.score_map import Findings, above, on_grid
-from detectors.surfaces.background import Background
-from detectors.surfaces.shared import shared_background
+from detectors.surfaces.background import Background, background
+from detectors.surfaces.shared import shared
 from detectors.surfaces.smooth_surfaces import raster
 from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.config import Config
@@ -140,7 +141,7 @@ class LocalDetector:
         For an organised cloud, they are the means over squares of ``pixels`` a side. Raises
         UserError on an empty crop, or if no surface can be fitted."""
         mask = crop(cloud, self.settings.crop)
-        ground = shared_background(cloud, mask, self.settings.surface)
+        ground = shared(background, cloud, mask, self.settings.surface)
         judged = mask & np.isfinite(ground.residual_m)
         if cloud.organised:
             rows, columns = np.nonzero(judged)
@@ -256,7 +257,8 @@ class LocalDetector:
             signed = np.minimum(signed, 0.0)
         peaks = _peak_of_cells(signed, thresholds[0])[cell_of_pixel]
         # number the peaks that have pixels in the order of their heights
-        _, labels = np.unique(peaks, return_inverse=True)
+        numbers = np.cumsum(np.bincount(peaks) > 0) - 1
+        labels = numbers[peaks]
         strengths = np.zeros(int(labels.max(initial=-1)) + 1)
         np.maximum.at(strengths, labels, scores)
         # by level and peak, the sums over pixels above the level's threshold: first over those not
@@ -657,7 +659,7 @@ def _peak_of_cells(signed: np.ndarray, threshold: float) -> np.ndarray:
     sizes = np.abs(signed).ravel()
     lowest_saddle = max(min(SADDLE * threshold, threshold - PROMINENCE), 0.0)
     cells = np.flatnonzero(sizes > lowest_saddle)
-    order = cells[np.argsort(-sizes[cells], kind="stable")]
+    order = cells[falling_order(sizes[cells])]
     peak_of = np.full(sizes.size, -1, dtype=np.int64)
     peak_of[order] = _peaks(signed, order, SADDLE, PROMINENCE)
     return peak_of

@@ -41,11 +41,11 @@ from detectors.findings import templates, whitening
 from detectors.findings.missing import missing_evidence
 from detectors.findings.rim import BLOCK_PX, on_pixels
 from detectors.interface import Evidence
-from detectors.methods import local, slots
+from detectors.methods import local
 from detectors.methods.deviations import RIM_PX, Residuals, covariance_of, in_deviations, rim_of
 from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, LocalPicture
 from detectors.methods.scatter import WIDE_PX
-from detectors.methods.template_scores import PictureNoise, scored
+from detectors.methods.template_scores import PictureNoise, scored, template_noise
 from detectors.pixels.masks import grown
 from harness.vocabulary.geometry import Cloud
 
@@ -231,16 +231,13 @@ def _judged(
     template's height. ``tamed`` (r, c): their values, clipped or not. ``rim`` (n,): variances that
     the rim adds to the covariance."""
     is_known = residuals.is_known
-    window_px = templates.window_of(covariance)
-    power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
     noise = PictureNoise(
-        whitening.filters(covariance, is_known.shape),
-        BLOCK_PX * on_pixels(rim, residuals.depth_px),
-        window_px,
-        templates.worths(power, window_px),
-        slots.energies(power, window_px),
+        filters=whitening.filters(covariance, is_known.shape),
+        rim=BLOCK_PX * on_pixels(rim, residuals.depth_px),
+        on_templates=template_noise(covariance),
     )
-    radius_px = np.array([template.radius_px for template in templates.bank(window_px)], np.float32)
+    bank = noise.bank
+    radius_px = np.array([template.radius_px for template in bank], np.float32)
     strong = _strong_findings(residuals.values, tamed, is_known, noise)
     quiet = is_known & ~grown(strong.core, MARGIN_PX)
     second = scored(tamed * quiet, quiet, noise, strong.discs, strong.solved)
@@ -249,11 +246,11 @@ def _judged(
     signed *= is_known
     # only now are deviations known; among those of round templates, that of the narrowest is known
     # best
-    is_slot = np.array([template.slot is not None for template in templates.bank(window_px)])
+    is_slot = np.array([template.slot is not None for template in bank])
     deviations = np.where(is_slot, second.deviations, second.deviations[0])
     signed[strong.core] = (strong.signed / deviations[strong.template])[strong.core]
     scores = (signed * ~_side_lobes(signed)).astype(np.float64)
-    return scores, noise.worths[0].energy ** -0.5
+    return scores, noise.on_templates.worths[0].energy ** -0.5
 
 
 def _tamed(values: np.ndarray) -> np.ndarray:
@@ -326,7 +323,7 @@ def _strong_findings(
     signed = np.zeros(known.shape)
     template = np.zeros(known.shape, np.uint8)
     discs = np.zeros(known.shape, np.uint8)
-    radius_px = np.array([template.radius_px for template in templates.bank(noise.window_px)])
+    radius_px = np.array([template.radius_px for template in noise.bank])
     for _ in range(MOST_ROUNDS):
         quiet = known & ~grown(core, MARGIN_PX)
         scores = scored(tamed * quiet, quiet, noise)

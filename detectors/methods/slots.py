@@ -250,9 +250,15 @@ def _best(  # type: ignore[no-untyped-def]
             for aside in range(-ASIDE, ASIDE + 1):
                 top = sums[_HALF_LINES + aside - half]
                 bottom = sums[_HALF_LINES + aside + half]
+                lowest = 0.0
+                highest = 0.0
                 for n in range(columns):
                     running[n + 1] = running[n] + sign * (bottom[n] - top[n])
+                    lowest = min(lowest, running[n + 1])
+                    highest = max(highest, running[n + 1])
                 for m in range(len(_LENGTHS)):
+                    if (highest - lowest) / root_energy[m, w] <= best:
+                        continue  # no piece of the line has a larger sum
                     points = _LENGTHS[m]
                     largest = 0.0
                     for n in range(_HALF_LENGTH - points, _HALF_LENGTH + 1):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -24,19 +25,50 @@ TAIL_PX = 1.5
 and too few of them are independent."""
 
 
-class PictureNoise(NamedTuple):
-    """The noise of a picture, and what it makes of the templates."""
+class TemplateNoise(NamedTuple):
+    """What noise makes of the templates."""
 
-    filters: whitening.Filters
-    rim: np.ndarray
-    """(r, c): variance of independent pixels whose means over `BLOCK_PX` vary as those at their
-    distance from the outline do beyond it."""
     window_px: int
     """Side of the camera's window that the noise indicates."""
     worths: tuple[templates.Worth, ...]
     """Worth of each template."""
     slot_energies: np.ndarray
     """Whitened energies of slots (`slots.energies`)."""
+
+
+def template_noise(covariance: np.ndarray) -> TemplateNoise:
+    """Return what noise with an autocovariance by lag makes of the templates: computed once for
+    all pictures that are judged by the same learned covariance."""
+    return _template_noise(covariance.tobytes(), covariance.shape, covariance.dtype.str)
+
+
+@lru_cache(maxsize=4)
+def _template_noise(values: bytes, shape: tuple[int, ...], kind: str) -> TemplateNoise:
+    covariance = np.frombuffer(values, kind).reshape(shape)
+    window_px = templates.window_of(covariance)
+    power = whitening.spectrum(covariance, (whitening.GRID, whitening.GRID))
+    return TemplateNoise(
+        window_px=window_px,
+        worths=templates.worths(power, window_px),
+        slot_energies=slots.energies(power, window_px),
+    )
+
+
+class PictureNoise(NamedTuple):
+    """The noise of a picture."""
+
+    filters: whitening.Filters
+    """Its covariance."""
+    rim: np.ndarray
+    """(r, c): variance of independent pixels whose means over `BLOCK_PX` vary as those at their
+    distance from the outline do beyond it."""
+    on_templates: TemplateNoise
+    """What it makes of the templates."""
+
+    @property
+    def bank(self) -> tuple[templates.Template, ...]:
+        """The templates as seen through the camera's window."""
+        return templates.bank(self.on_templates.window_px)
 
 
 class Scores(NamedTuple):
@@ -126,11 +158,11 @@ def scored(
     coarse_best = _Best(coarse.seen.shape)
     slot_best = _Best(coarse.seen.shape)
     tail = 1.0
-    deviations = np.ones(len(templates.bank(noise.window_px)))
+    deviations = np.ones(len(noise.bank))
     slot_responses = {}
     for view, number, response in _responses(fine, coarse, noise, strong is None):
-        template = templates.bank(noise.window_px)[number]
-        worth = noise.worths[number]
+        template = noise.bank[number]
+        worth = noise.on_templates.worths[number]
         score = view.score
         if template.slot is not None:
             slot_responses[number] = response.copy()
@@ -159,7 +191,7 @@ def scored(
             number,
         )
     # errors along outlines, from light and flying pixels, look like slots
-    blurred = slots.blurred(solved, noise.window_px) * (fine.depth_px > RIM_PX)
+    blurred = slots.blurred(solved, noise.on_templates.window_px) * (fine.depth_px > RIM_PX)
     refined = _refined_slots(slot_best, slot_responses, blurred, noise)
     # linear interpolation would lower the narrow ridges of slots' scores by a seventh
     _merge(best, coarse_best, cv2.INTER_LINEAR)
@@ -187,19 +219,21 @@ def _refined_slots(
     refined = []
     for row, column in slots.peaks_of(slot_best.signed).tolist():
         number = int(slot_best.template[row, column])
-        sides = templates.bank(noise.window_px)[number].slot
+        sides = noise.bank[number].slot
         assert sides is not None
         score = float(slot_best.signed[row, column])
         slot = slots.best_slot(
             blurred,
-            noise.slot_energies,
+            noise.on_templates.slot_energies,
             (2 * row + 0.5, 2 * column + 0.5),
             sides,
             math.copysign(1.0, score),
         )
         # what is seen there, the deviation of scores and how it differs there are those of the
         # bank's slot: of the other widths the deviations differ by up to 4 %
-        response = float(responses[number][row, column]) * noise.worths[number].energy ** -0.5
+        response = (
+            float(responses[number][row, column]) * noise.on_templates.worths[number].energy ** -0.5
+        )
         final = slots.lowered(np.array(score / response * slot.score))
         refined.append((slot._replace(score=float(final)), number))
     return refined
@@ -236,8 +270,8 @@ def _responses(
 ) -> Iterator[tuple[_SeenGrid, int, np.ndarray]]:
     """Yield for each template the view on which it is scored, its number, and its response t' C^-1
     r (r, c), which the next one overwrites."""
-    bank = templates.bank(noise.window_px)
-    for pair, numbers in templates.spectra(noise.filters.power.shape, noise.window_px):
+    bank = noise.bank
+    for pair, numbers in templates.spectra(noise.filters.power.shape, noise.on_templates.window_px):
         if only_centred and all(any(bank[number].halves) for number in numbers):
             continue
         view = coarse if bank[numbers[0]].coarse else fine

@@ -13,8 +13,9 @@ from detectors.crop import BoxCrop, CropConfig, crop
 from detectors.interface import Evidence
 from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.score_map import ScoreMapConfig, ScoreMapDetector, on_grid
-from detectors.surfaces.shared import shared_background
-from detectors.surfaces.surface import SurfaceConfig, fit_surface
+from detectors.surfaces.background import background
+from detectors.surfaces.shared import shared, stated_surface
+from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.geometry import Cloud
 
 
@@ -56,7 +57,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
         x = cloud.points_m[..., 0][mask]
         y = cloud.points_m[..., 1][mask]
         z = cloud.points_m[..., 2][mask]
-        surface = fit_surface(x, y, z, self.settings.surface)
+        surface = shared(stated_surface, cloud, mask, self.settings.surface)
         fitted = surface.evaluate(x, y)
         residual_m = z - fitted
         floor_m = rounding_floor(cloud, mask)
@@ -94,7 +95,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
     def _before_background(self, cloud: Cloud, mask: np.ndarray) -> Evidence:
         """Analyse with a surface whose shape is chosen. One unit of score is the noise around each
         pixel."""
-        ground = shared_background(cloud, mask, self.settings.surface)
+        ground = shared(background, cloud, mask, self.settings.surface)
         unit_m = np.maximum(ground.noise_m, rounding_floor(cloud, mask))
         stated_m = self._stated_deviation(cloud, mask)
         if stated_m is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from detectors.pixels.ordering import falling_order, rising_order
 from harness.vocabulary.errors import UserError
 
 AXIS_BITS = 21  # of a cell's key that hold its number along one axis
@@ -74,9 +75,9 @@ def nested_clusters(
         )
     # the margin makes a neighbour's key the sum of the cell's key and the key of the offset
     x, y, z = cells.astype(np.int64).T + NEAR_CELLS
-    falling = np.argsort(-scores, kind="stable")
+    falling = falling_order(scores)
     key = (((x << AXIS_BITS | y) << AXIS_BITS) | z)[falling]
-    by_cell = np.argsort(key, kind="stable")
+    by_cell = rising_order(key)
     starts = np.flatnonzero(np.diff(key[by_cell], prepend=-1))
     # the points of a cell, one cell after another, the highest score first
     order = falling[by_cell]

@@ -18,12 +18,14 @@ import cv2
 import numpy as np
 
 from detectors.pixels.masks import grown, on_grid
-from detectors.pixels.medians import group_medians
+from detectors.pixels.medians import group_medians, row_medians
 from detectors.pixels.noise import median_of, rounding_floor, sigma_of
 from detectors.surfaces.extruded import Profile, direction_of, profiled
 from detectors.surfaces.free_form import free_form, picture_places
+from detectors.surfaces.shared import shared, stated_surface
 from detectors.surfaces.surface import (
     BISQUARE_TUNING,
+    Surface,
     SurfaceConfig,
     SurfaceFunction,
     along_rays,
@@ -177,7 +179,8 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         name = reference.text
         fit = reference.z_at
     elif config.shape in STATED:
-        name, fit = _stated(points, config, central)
+        surface = shared(stated_surface, cloud, mask, config)
+        name, fit = _named(surface, points, config, central)
     else:
         shape, cells, profile = _shape_of(points, cells, config, rounding_floor(cloud, mask))
         name = shape.name
@@ -237,7 +240,8 @@ def _of_few_points(
     else:
         if config.shape not in STATED:
             config = SurfaceConfig(degree=1)
-        name, fit = _stated(points, config, cloud.projection == "central")
+        surface = shared(stated_surface, cloud, mask, config)
+        name, fit = _named(surface, points, config, cloud.projection == "central")
     fitted = fit(points)
     residuals = points[:, 2] - fitted
     noise_m = sigma_of(residuals)
@@ -280,7 +284,9 @@ def _shape_of(
     with the profile that it contains, if any. ``rounding_m``: deviation that rounding leaves in
     the points."""
     sample = points[:: max(1, len(points) // 8192)]
-    _, start = _stated(sample, SurfaceConfig(degree=2, method="bisquare"), cells.central)
+    quadratic = SurfaceConfig(degree=2, method="bisquare")
+    surface = fit_surface(*sample.T, quadratic)
+    _, start = _named(surface, sample, quadratic, cells.central)
     cells = cells.refreshed(points[:, 2] - start(points), start)
     shapes, errors = _formula_shapes(cells)
     worth = WORTH * cells.pixel_noise
@@ -343,9 +349,8 @@ def _noise_of_points(cells: _Cells) -> np.ndarray:
     windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7))
     around = windows[cells.row, cells.column].reshape(-1, 49)
     pixel = cells.pixel_noise
-    is_known = np.isfinite(around).any(axis=1)
-    local = np.full(len(around), pixel)
-    local[is_known] = np.hypot(np.nanmedian(around[is_known], axis=1), cells.level_noise)
+    medians = row_medians(around)
+    local = np.where(np.isfinite(medians), np.hypot(medians, cells.level_noise), pixel)
     of_cells = np.where(local > NOISIER * pixel, local, pixel)
     return np.where(cells.cell_of_point >= 0, of_cells[cells.cell_of_point], pixel)
 
@@ -364,12 +369,11 @@ def misfit(cloud: Cloud, residual_m: np.ndarray, surface: str) -> str:
     return _misfit(level, lambda p: np.zeros(len(p)), surface)[0]
 
 
-def _stated(
-    points: np.ndarray, config: SurfaceConfig, central: bool
+def _named(
+    surface: Surface, points: np.ndarray, config: SurfaceConfig, central: bool
 ) -> tuple[str, SurfaceFunction]:
-    """Return the name and the fit of a polynomial that is stated. ``central``: rays leave the
-    origin, else along z."""
-    surface = fit_surface(points[:, 0], points[:, 1], points[:, 2], config)
+    """Return the name of a polynomial through points (n, 3), and its z along their rays.
+    ``central``: rays leave the origin, else along z."""
 
     def z_at(queries: np.ndarray) -> np.ndarray:
         return surface.evaluate(queries[:, 0], queries[:, 1])

@@ -1,19 +1,34 @@
-"""The fitted surface of a cloud, once for all detectors that judge it."""
+"""The fitted surfaces of a cloud, each once for all detectors that judge it."""
 
 import hashlib
+from collections.abc import Callable
+from typing import TypeVar, cast
 
 import numpy as np
 
-from detectors.surfaces.background import Background, background
-from detectors.surfaces.surface import SurfaceConfig
+from detectors.surfaces.surface import Surface, SurfaceConfig, fit_surface
 from harness.vocabulary.geometry import Cloud
 
+Fitted = TypeVar("Fitted")
 
-def shared_background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
-    """Return `background` of the cloud's points where ``mask`` (h, w) is true; do not write to it.
 
-    A cloud keeps its surfaces by mask and settings. Raises UserError as `background` does."""
-    key = config.model_dump_json(), hashlib.blake2b(mask.tobytes()).digest()
+def shared(
+    fit: Callable[[Cloud, np.ndarray, SurfaceConfig], Fitted],
+    cloud: Cloud,
+    mask: np.ndarray,
+    config: SurfaceConfig,
+) -> Fitted:
+    """Return what ``fit`` makes of the cloud's points where ``mask`` (h, w) is true; do not write
+    to it.
+
+    A cloud keeps its surfaces by kind, mask and settings. Raises UserError as ``fit`` does."""
+    key = fit.__name__, config.model_dump_json(), hashlib.blake2b(mask.tobytes()).digest()
     if key not in cloud.surfaces:
-        cloud.surfaces[key] = background(cloud, mask, config)
-    return cloud.surfaces[key]
+        cloud.surfaces[key] = fit(cloud, mask, config)
+    return cast("Fitted", cloud.surfaces[key])
+
+
+def stated_surface(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Surface:
+    """Return `fit_surface` of the cloud's points where ``mask`` (h, w) is true."""
+    x_m, y_m, z_m = cloud.points_m[mask].T
+    return fit_surface(x_m, y_m, z_m, config)

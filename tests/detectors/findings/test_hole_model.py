@@ -13,7 +13,8 @@ from detectors.findings import hole_model_reference as reference
 from detectors.findings.hole_model import (
     WALL_PRIOR,
     HolePatch,
-    _smooth_rows,
+    _smooth,
+    _smooth_columns,
     fit_hole,
     lens_side,
     pictures,
@@ -114,15 +115,30 @@ def test_pictures_of_several_holes_are_those_of_each():
 
 @pytest.mark.parametrize("deviation_px", [0.0, 0.45, 0.81, 0.82, 1.5, 4.0])
 def test_a_lens_rectangle_has_the_second_moment_of_its_blur(deviation_px: float) -> None:
-    """Means over rows of pixels, of which the last ones count in parts; beyond sides of 3 pixels,
+    """Means over columns of pixels, of which the last ones count in parts; beyond sides of 3 pixels,
     these parts leave 7 %."""
-    row = np.zeros((1, 41))
-    row[0, 20] = 1.0
-    _smooth_rows(row, lens_side(deviation_px))
-    moment_px2 = float(row[0] @ (np.arange(41) - 20.0) ** 2)
-    assert row.sum() == pytest.approx(1.0)
+    column = np.zeros((41, 1))
+    column[20] = 1.0
+    _smooth_columns(column, lens_side(deviation_px), 0)
+    moment_px2 = float(column[:, 0] @ (np.arange(41) - 20.0) ** 2)
+    assert column.sum() == pytest.approx(1.0)
     error = 1e-9 if deviation_px < 0.82 else 0.07
     assert moment_px2 == pytest.approx(deviation_px**2, rel=error, abs=1e-12)
+
+
+@pytest.mark.parametrize("corner", [(12, 9), (0, 0), (28, 25), (40, 40)])
+def test_a_picture_is_smoothed_where_it_is_not_0(corner: tuple[int, int]) -> None:
+    """To the last bit as the whole, in the middle, at the edges, and without anything."""
+    top, left = corner
+    image = np.zeros((31, 29))
+    noise = np.random.default_rng(0).standard_normal((6, 7))
+    image[top : top + 6, left : left + 7] = noise[: max(31 - top, 0), : max(29 - left, 0)]
+    turned = image.T.copy()
+    _smooth_columns(turned, 3.7, 0)
+    whole = turned.T.copy()
+    _smooth_columns(whole, 1.25, 0)
+    _smooth(image, 3.7, 1.25)
+    np.testing.assert_array_equal(image, whole)
 
 
 def pixels_of(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
