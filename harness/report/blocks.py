@@ -10,7 +10,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from harness.vocabulary.provenance import GENERATOR
 from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment, Template
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
@@ -54,6 +54,12 @@ MOST_HEADLINE_WORDS = 20
 def template(name: str, folder: Path = HERE) -> Template:
     """Load a template from ``folder`` or from this folder; undefined names are errors, and text is
     escaped."""
+    return _environment(folder).get_template(name)
+
+
+@cache
+def _environment(folder: Path) -> Environment:
+    """Return what compiles the templates of a folder, each once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -78,7 +84,7 @@ def template(name: str, folder: Path = HERE) -> Template:
         caption="",
         scene="",
     )
-    return environment.get_template(name)
+    return environment
 
 
 def page(
