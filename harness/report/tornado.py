@@ -59,7 +59,7 @@ class _Axis:
         return [(self.px(number * step_mm), f"{number * step_mm:.4g}") for number in numbers]
 
 
-def tornado_figure(name: str, result: SetUpResult, stated_mm: float) -> str:
+def tornado_figure(result: SetUpResult, stated_mm: float) -> str:
     """Draw a bar for each unknown of a set-up from its smallest a90 to its largest, with the
     interval of each end, and a line at a90 at the stated values."""
     unknowns = result.unknowns
@@ -91,7 +91,6 @@ def tornado_figure(name: str, result: SetUpResult, stated_mm: float) -> str:
     bottom_px = TOP_PX + ROW_PX * len(rows)
     return template("tornado.svg").render(
         alt=f"How far each unknown moves a90 of {result.limit.record.label}, as unknowns.csv says.",
-        name=name,
         width=WIDTH_PX,
         height=bottom_px + BELOW_PX,
         left=axis.left_px,

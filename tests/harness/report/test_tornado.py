@@ -29,7 +29,7 @@ def _sizes_mm(figure, places_px):
 
 
 def test_bars_reach_from_the_smallest_to_the_largest_a90(judged):
-    figure = tornado_figure("tornado-1", judged, 5.0)
+    figure = tornado_figure(judged, 5.0)
     bars = re.findall(r'<rect x="([\d.]+)" y="[\d.]+" width="([\d.]+)"[^>]*--(\w+)\)', figure)
     effects = judged.unknowns.effects
     assert len(bars) == len(effects)
@@ -46,7 +46,7 @@ def test_intervals_stand_at_their_ends_and_stop_at_the_axis(judged):
     endless[first.highest_level] = Interval(5.0, 1e6)
     changed = replace(first, intervals_mm=tuple(endless))
     effects = (changed, *unknowns.effects[1:])
-    figure = tornado_figure("t", replace(judged, unknowns=replace(unknowns, effects=effects)), 5.0)
+    figure = tornado_figure(replace(judged, unknowns=replace(unknowns, effects=effects)), 5.0)
     lines = re.findall(
         r'<path d="M([\d.]+) [\d.]+H([\d.]+)" style="stroke:var\(--grey\)"/>', figure
     )
@@ -58,8 +58,8 @@ def test_intervals_stand_at_their_ends_and_stop_at_the_axis(judged):
 
 
 def test_lines_stand_at_the_stated_values_and_over_all_unknowns(judged):
-    figure = tornado_figure("t", judged, 5.0)
+    figure = tornado_figure(judged, 5.0)
     both = re.findall(r'<path d="M([\d.]+) 6V[\d.]+" style="stroke:var\(--grey\)"', figure)
     assert _sizes_mm(figure, both) == pytest.approx([5.0, judged.limit.a90_mm], abs=0.02)
-    without = tornado_figure("t", judged, float("nan"))
+    without = tornado_figure(judged, float("nan"))
     assert "at the stated values" in figure and "at the stated values" not in without
