@@ -120,9 +120,9 @@ def expected(out: Path, name: str, renders: int, trials: int, processes: int) ->
     total_s = fixed_s + renders * render_s + trials * trial_s
     cores = min(processes, os.cpu_count() or 1)
     return (
-        f"from nothing {_duration(total_s)} of processor time ({_duration(renders * render_s)} "
-        f"for renders, {_duration(trials * trial_s)} for trials), or {_duration(total_s / cores)} "
-        f"on {many(cores, 'idle core')}; {basis}"
+        f"expected from nothing: {_duration(total_s)} of processor time "
+        f"({_duration(renders * render_s)} for renders, {_duration(trials * trial_s)} for trials), "
+        f"or {_duration(total_s / cores)} on {many(cores, 'idle core')}; {basis}"
     )
 
 

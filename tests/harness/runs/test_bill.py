@@ -66,15 +66,15 @@ def stored_bill(folder, done: tuple[int, int], **seconds: float) -> None:
 def test_the_expected_cost_comes_from_runs_of_the_same_experiment(tmp_path, monkeypatch):
     monkeypatch.setattr(bills.os, "cpu_count", lambda: 8)
     assert expected(tmp_path, "crack", 10, 100, processes=2) == (
-        "from nothing 54 s of processor time (2 s for renders, 40 s for trials), or 27 s on 2 idle "
-        f"cores; very roughly: no such run has been billed in {tmp_path} yet"
+        "expected from nothing: 54 s of processor time (2 s for renders, 40 s for trials), or 27 s "
+        f"on 2 idle cores; very roughly: no such run has been billed in {tmp_path} yet"
     )
     other = {"renders": 50.0, "detection": 3.0, "imports": 1.0}
     stored_bill(tmp_path / "other" / "1", (1, 1), **other)
     (tmp_path / "other" / "latest").symlink_to("1")
     assert expected(tmp_path, "crack", 10, 100, processes=16) == (
-        "from nothing 13.3 min of processor time (8.3 min for renders, 5.0 min for trials), or "
-        "1.7 min on 8 idle cores; roughly, by the bills of other experiments"
+        "expected from nothing: 13.3 min of processor time (8.3 min for renders, 5.0 min for "
+        "trials), or 1.7 min on 8 idle cores; roughly, by the bills of other experiments"
     )
     first = {"renders": 4.0, "frames": 5.0, "detection": 10.0, "plan": 1.5}
     stored_bill(tmp_path / "crack" / "1", (2, 50), **first)
@@ -83,8 +83,8 @@ def test_the_expected_cost_comes_from_runs_of_the_same_experiment(tmp_path, monk
     (tmp_path / "crack" / "3").mkdir()
     (tmp_path / "crack" / "3" / PROVENANCE.name).write_text("{}")
     assert expected(tmp_path, "crack", 10, 100, processes=1) == (
-        "from nothing 53 s of processor time (20 s for renders, 30 s for trials), or 53 s on 1 "
-        "idle core; by the bills of earlier runs of this experiment"
+        "expected from nothing: 53 s of processor time (20 s for renders, 30 s for trials), or 53 s "
+        "on 1 idle core; by the bills of earlier runs of this experiment"
     )
 
 
@@ -92,5 +92,5 @@ def test_a_cost_that_no_run_of_the_experiment_tells_is_that_of_others(tmp_path):
     stored_bill(tmp_path / "crack" / "1", (0, 10), detection=5.0, plan=2.0)
     stored_bill(tmp_path / "other" / "1", (10, 10), renders=40.0, detection=90.0)
     assert expected(tmp_path, "crack", 1, 2, processes=1).startswith(
-        "from nothing 7 s of processor time (4 s for renders, 1 s for trials)"
+        "expected from nothing: 7 s of processor time (4 s for renders, 1 s for trials)"
     )
