@@ -39,7 +39,10 @@ SHOWN_FIRST = (
     "versions",
 )
 """Keys of the provenance that every page shows, as "not recorded" if they are missing."""
-SHOWN_APART = ("command", "seconds", "failures")
+BILL = "processor_seconds"
+"""Key of a run's bill in its provenance: seconds by phase, or a function that returns them, because
+a page is a part of what it states."""
+SHOWN_APART = ("command", "seconds", "failures", BILL)
 """Keys of the provenance that stand in sections of their own."""
 MOST_NAMED = 3
 """Most trials that are named for the same failure."""
@@ -189,18 +192,41 @@ def closing(
     parts = [heading("Failures"), *_failures(provenance.get("failures", ()))]
     if left_out:
         parts.append(paragraph(left_out))
-    seconds = provenance.get("seconds", {})
-    cost = paragraph("Not recorded.")
-    if seconds:
-        rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
-        cost = Grid.of(("stage", "seconds"), rows).html()
     command = command_of(provenance.get("command", "not recorded"))
     return [
         *parts,
         heading("Provenance"),
-        fold("Cost, versions and command", cost, origin_table(provenance), *command),
+        fold("Cost, versions and command", *_cost(provenance), origin_table(provenance), *command),
         fold("The resolved experiment", tag("pre", experiment_yaml_text)),
     ]
+
+
+def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
+    """Return what a run cost: its bill, or, of programs without one, seconds by stage."""
+    bill = provenance.get(BILL)
+    seconds = provenance.get("seconds", {})
+    if bill is None:
+        if not seconds:
+            return [paragraph("Not recorded.")]
+        rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
+        return [Grid.of(("stage", "seconds"), rows).html()]
+    by_phase = bill() if callable(bill) else bill
+    total_s = sum(by_phase.values())
+    rows = []
+    for phase, phase_s in [*by_phase.items(), ("in all", total_s)]:
+        rows.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
+    counts = []
+    for name in ("renders", "trials"):
+        if name in provenance:
+            counts.append(f"{provenance[name]['done']} {name}")
+    done = f" {' and '.join(counts)} were done;" if counts else ""
+    wall_s = seconds.get("this run in all")
+    took = f" It took {float(wall_s):.0f} s before this page was drawn." if wall_s else ""
+    explained = (
+        f"Processor seconds of all processes of this run.{done} what was stored before costs "
+        f"nothing here.{took}"
+    )
+    return [Grid.of(("phase", "processor seconds", "share"), rows).html(), note(explained)]
 
 
 def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.records.outputs import PROVENANCE
+from harness.report.blocks import BILL
 from harness.runs.jobs import Ended, Job, JobEngine, Stage
 from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
 from harness.vocabulary.text import many
 
-BILL = "processor_seconds"
-"""Its key in a run's provenance."""
 PHASES = ("imports", "plan", "renders", "frames", "detection", "statistics", "tables and page")
 FIXED = ("imports", "plan", "statistics", "tables and page")
 """Phases whose cost depends on neither renders nor trials."""

@@ -185,6 +185,9 @@ def _write_results(
     provenance = _provenance(experiment, plan, outcome, tables, origin)
     provenance["seconds"]["this run in all"] = round(time.monotonic() - began, 1)
     write_tables(folder, tables.stored(), provenance)
+    engine.bill.divide_trials(_frames_share(tables))
+    # a page calls it when its figures are drawn
+    provenance[BILL] = engine.bill.rounded
     if experiment.config.study is None:
         answer = _write_report(folder, experiment, outcome, tables, provenance)
     else:
@@ -198,7 +201,6 @@ def _write_results(
             journal=journal,
             engine=engine,
         )
-    engine.bill.divide_trials(_frames_share(tables))
     provenance[BILL] = engine.bill.rounded()
     write_json(folder / PROVENANCE.name, provenance)
     return [*(f"warning: {text}" for text in provenance["warnings"]), *answer]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 
 from harness.records.outputs import PROVENANCE
+from harness.report.blocks import BILL, closing
 from harness.runs import bill as bills
-from harness.runs.bill import BILL, PHASES, Bill, Metered, expected
+from harness.runs.bill import PHASES, Bill, Metered, expected
 from harness.runs.jobs import Ended, Job
 from harness.runs.processes import Limits, LocalEngine
 from tests.support import faulty_jobs
@@ -50,6 +52,24 @@ def test_a_process_says_what_its_jobs_cost():
         assert engine.room("trials") == 2
     assert 0.2 <= ended.processor_s < 1.0
     assert bill.rounded()["detection"] >= 0.2
+
+
+def test_a_page_shows_each_phase_with_its_share():
+    """The bill is asked for when the page is closed, and its parts come to the whole."""
+    seconds = {"imports": 1.0, "renders": 6.0, "detection": 3.0}
+    provenance = {
+        BILL: lambda: dict(seconds),
+        "seconds": {"this run in all": 12.3},
+        "renders": {"done": 2, "cached": 1},
+        "trials": {"done": 5},
+    }
+    seconds["renders"] = 12.0
+    page = " ".join(closing(provenance, ""))
+    words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
+    for row in ("imports 1.0 6 %", "renders 12.0 75 %", "detection 3.0 19 %", "in all 16.0 100 %"):
+        assert row in words
+    assert "2 renders and 5 trials were done" in words and "It took 12 s" in words
+    assert words.count("imports") == 1  # not once more among versions
 
 
 def stored_bill(folder, done: tuple[int, int], **seconds: float) -> None:
