@@ -10,7 +10,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from harness.vocabulary.provenance import GENERATOR
 from harness.vocabulary.text import Grid, many
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment, Template
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
@@ -39,7 +39,10 @@ SHOWN_FIRST = (
     "versions",
 )
 """Keys of the provenance that every page shows, as "not recorded" if they are missing."""
-SHOWN_APART = ("command", "seconds", "failures")
+BILL = "processor_seconds"
+"""Key of a run's bill in its provenance: seconds by phase, or a function that returns them, because
+a page is a part of what it states."""
+SHOWN_APART = ("command", "seconds", "failures", BILL)
 """Keys of the provenance that stand in sections of their own."""
 MOST_NAMED = 3
 """Most trials that are named for the same failure."""
@@ -54,6 +57,12 @@ MOST_HEADLINE_WORDS = 20
 def template(name: str, folder: Path = HERE) -> Template:
     """Load a template from ``folder`` or from this folder; undefined names are errors, and text is
     escaped."""
+    return _environment(folder).get_template(name)
+
+
+@cache
+def _environment(folder: Path) -> Environment:
+    """Return what compiles the templates of a folder, each once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
@@ -78,7 +87,7 @@ def template(name: str, folder: Path = HERE) -> Template:
         caption="",
         scene="",
     )
-    return environment.get_template(name)
+    return environment
 
 
 def page(
@@ -183,18 +192,41 @@ def closing(
     parts = [heading("Failures"), *_failures(provenance.get("failures", ()))]
     if left_out:
         parts.append(paragraph(left_out))
-    seconds = provenance.get("seconds", {})
-    cost = paragraph("Not recorded.")
-    if seconds:
-        rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
-        cost = Grid.of(("stage", "seconds"), rows).html()
     command = command_of(provenance.get("command", "not recorded"))
     return [
         *parts,
         heading("Provenance"),
-        fold("Cost, versions and command", cost, origin_table(provenance), *command),
+        fold("Cost, versions and command", *_cost(provenance), origin_table(provenance), *command),
         fold("The resolved experiment", tag("pre", experiment_yaml_text)),
     ]
+
+
+def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
+    """Return what a run cost: its bill, or, of programs without one, seconds by stage."""
+    bill = provenance.get(BILL)
+    seconds = provenance.get("seconds", {})
+    if bill is None:
+        if not seconds:
+            return [paragraph("Not recorded.")]
+        rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
+        return [Grid.of(("stage", "seconds"), rows).html()]
+    by_phase = bill() if callable(bill) else bill
+    total_s = sum(by_phase.values())
+    rows = []
+    for phase, phase_s in [*by_phase.items(), ("in all", total_s)]:
+        rows.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
+    counts = []
+    for name in ("renders", "trials"):
+        if name in provenance:
+            counts.append(f"{provenance[name]['done']} {name}")
+    done = f" {' and '.join(counts)} were done;" if counts else ""
+    wall_s = seconds.get("this run in all")
+    took = f" It took {float(wall_s):.0f} s before this page was drawn." if wall_s else ""
+    explained = (
+        f"Processor seconds of all processes of this run.{done} what was stored before costs "
+        f"nothing here.{took}"
+    )
+    return [Grid.of(("phase", "processor seconds", "share"), rows).html(), note(explained)]
 
 
 def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:

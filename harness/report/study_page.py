@@ -201,7 +201,7 @@ def _tornadoes(result: StudyResult) -> dict[str, str]:
         if name:
             stated = stated_of(result, set_up.limit)
             stated_mm = np.nan if stated is None else stated.a90_mm
-            figures[name] = tornado_figure(name, set_up, stated_mm)
+            figures[name] = tornado_figure(set_up, stated_mm)
     return figures
 
 

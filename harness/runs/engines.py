@@ -4,7 +4,7 @@ cluster.
 Engines are named here and imported when they are chosen, so that only a run on a cluster imports
 Dask."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -22,15 +22,18 @@ def engine_of(
     folder: Path = Path(),
     *,
     renders: bool = True,
+    further: Sequence[str] = (),
 ) -> JobEngine:
     """Return the engine, not yet started, for trials of ``detectors``. ``folder``: of renders;
-    ``renders``: whether any are to be expected. Raises UserError."""
+    ``renders``: whether any are to be expected; ``further``: modules that other jobs need. Raises
+    UserError."""
     from harness.runs.processes import LocalEngine, SerialEngine
 
     if options.serial:
         return SerialEngine()
     if options.scheduler is None:
-        return LocalEngine(options.jobs, options.limits, code_of(detectors), renders=renders)
+        code = code_of(detectors)
+        return LocalEngine(options.jobs, options.limits, code, renders=renders, further=further)
     module_name, _, class_name = CLUSTER.partition(":")
     cluster_engine = getattr(import_module(module_name), class_name)
     engine: JobEngine = cluster_engine(

@@ -120,8 +120,7 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
             f"  the journal holds {many(stored_records, 'trial')}; those of the same code "
             "and settings are not run again"
         )
-    cost = expected(Path(out), name, len(renders), trials)
-    if cost:
-        print(f"  {cost}")
+    processes = 1 if options.serial else options.jobs
+    print(f"  {expected(Path(out), name, len(renders), trials, processes)}")
     print(f"  results would go to {folder}")
     return 0

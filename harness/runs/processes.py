@@ -88,7 +88,8 @@ class LocalEngine:
     ``limits`` hold for trials; renders have no memory limit, because Dr.Jit reserves more than it
     uses. ``code``: modules that determine a stage's results. A process that starts after an edit
     of their sources is refused: its results would differ. ``renders``: whether any are to be
-    expected; if not, their modules are loaded only when one comes."""
+    expected; if not, their modules are loaded only when one comes. ``further``: modules that other
+    jobs need, such as statistics, which are then loaded once and not by each process."""
 
     def __init__(
         self,
@@ -97,13 +98,14 @@ class LocalEngine:
         code: Mapping[Stage, Code] | None = None,
         *,
         renders: bool = True,
+        further: Sequence[str] = (),
     ) -> None:
         self.code = dict(code or {})
         self.digests = {stage: source_digest(*code) for stage, code in self.code.items()}
         self.false_starts = 0
         self.is_over = False
         self.trace_files: tempfile.TemporaryDirectory[str]
-        self._preloaded = (TRIALS, RENDERS) if renders else (TRIALS,)
+        self._preloaded = (TRIALS, *([RENDERS] if renders else []), *further)
         self._limits = limits
         self._most: dict[Stage, int] = {"trials": jobs, "renders": min(jobs, MOST_RENDERERS)}
         self._waiting: dict[Stage, deque[tuple[Job, Limits, Answers]]] = {

@@ -42,8 +42,9 @@ _LOG_CDF: dict[str, Function] = {
 }
 _MIRRORED = {"logit": "logit", "probit": "probit", "cloglog": "loglog", "loglog": "cloglog"}
 LINKS = tuple(_CDF)
-# curves times targets, or resampled boards times their targets, in one block: 1 MB per array
-CELLS = 2**17
+# Curves times targets, or resampled boards times their targets, in one block: arrays of 256 kB,
+# whose memory is used again. Arrays of 1 MB get new memory, which takes three times as long.
+CELLS = 2**15
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ stretched for the coefficients; with 36 boards they hold the truth in 85 to 98 %
 Not modelled: interactions (blur may matter more where nothing stands behind), and effects that
 are not linear over a range, of which a monotone one is still seen."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -95,6 +97,83 @@ class _Coded:
     """Codes (n, k) of the targets."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Boards:
+    """Targets as a grid, one column for each board. All targets of a board have the same unknowns
+    and are drawn together, so that sums over them need their sizes and outcomes alone, and only
+    sums over boards the coefficients: a tenth of the time of a design with a row for each target.
+    """
+
+    design: np.ndarray
+    """Columns (boards, k): a constant and the codes of the unknowns."""
+    log_size: np.ndarray
+    """Logarithm (rows, boards) of the sizes; that of the first target where a board has fewer."""
+    hits: np.ndarray
+    """Number of hits (rows, boards); 0 where a board has fewer targets."""
+    misses: np.ndarray
+    """Number of misses (rows, boards); 0 likewise."""
+
+    @staticmethod
+    def of(targets: Targets, coded_unknowns: Sequence[_Coded]) -> _Boards:
+        """Return the grid of targets, which are sorted by their boards."""
+        _, first, board, counts = np.unique(
+            targets.board, return_index=True, return_inverse=True, return_counts=True
+        )
+        constant = np.ones((len(first), 1))
+        columns = [coded.columns[first] for coded in coded_unknowns]
+        row = np.arange(len(board)) - first[board]
+        log_size = np.tile(np.log(targets.size_mm[first]), (counts.max(), 1))
+        log_size[row, board] = np.log(targets.size_mm)
+        hits = np.zeros_like(log_size)
+        hits[row, board] = targets.hits
+        misses = np.zeros_like(log_size)
+        misses[row, board] = targets.inspections - targets.hits
+        return _Boards(
+            design=np.hstack([constant, *columns]), log_size=log_size, hits=hits, misses=misses
+        )
+
+    def likelihood(
+        self, b: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the log-likelihood (d,), its gradient (d, 2 k) and the expected information
+        (d, 2 k, 2 k) of studies with these ``weights`` (d, boards) at b (d, 2 k)."""
+        columns = self.design.shape[1]
+        middle = b[:, :columns] @ self.design.T
+        steepness = np.exp(-b[:, columns:] @ self.design.T)
+        predictor = (self.log_size - middle[:, None]) * steepness[:, None]
+
+        def of_boards(of_targets: np.ndarray) -> np.ndarray:
+            """Return the weighted sums (d, boards) of values (d, rows, boards)."""
+            return np.asarray(weights * of_targets.sum(axis=1))
+
+        log_hit, log_miss, _ = logs_of_link(LINK, predictor)
+        value = of_boards(self.hits * log_hit + self.misses * log_miss).sum(axis=1)
+
+        # the predictor falls by steepness with the middle, and by itself with the logarithm of the
+        # width
+        up, down, _ = slopes_of_link(LINK, predictor)
+        residual = self.hits * up - self.misses * down
+        by_middle = -(of_boards(residual) * steepness) @ self.design
+        by_log_width = -of_boards(residual * predictor) @ self.design
+        gradient = np.concatenate([by_middle, by_log_width], axis=1)
+
+        weight = (self.hits + self.misses) * up * down
+        weighted = weight * predictor
+        middles = self._squares(of_boards(weight) * steepness**2)
+        both = self._squares(of_boards(weighted) * steepness)
+        widths = self._squares(of_boards(weighted * predictor))
+        upper = np.concatenate([middles, both], axis=2)
+        lower = np.concatenate([both, widths], axis=2)
+        return value, gradient, np.concatenate([upper, lower], axis=1)
+
+    def _squares(self, weights: np.ndarray) -> np.ndarray:
+        """Return the design's weighted squares (d, k, k) for weights (d, boards)."""
+        columns = self.design.shape[1]
+        products = self.design[:, :, None] * self.design[:, None, :]
+        flat = weights @ products.reshape(len(self.design), -1)
+        return np.asarray(flat.reshape(-1, columns, columns))
+
+
 def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | None:
     """Return what the unknowns of a set-up do to a90; None for a set-up that draws none.
     Deterministic."""
@@ -106,18 +185,18 @@ def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | Non
     why = _no_effects(targets, coded_unknowns)
     if why:
         return OverUnknowns(effects=(), lowest_mm=np.nan, highest_mm=np.nan, why=why)
-    constant = np.ones((len(targets.board), 1))
-    design = np.hstack([constant, *[coded.columns for coded in coded_unknowns]])
-    every_target_once = np.ones((1, len(targets.board)))
-    fitted = _fitted(targets, design, every_target_once, None)
-    resampled = _resampled(targets, design, fitted, draws)
+    boards = _Boards.of(targets, coded_unknowns)
+    every_board_once = np.ones((1, len(boards.design)))
+    fitted = _fitted(boards, every_board_once, None)
+    resampled = _resampled(targets, boards, fitted, draws)
+    columns = boards.design.shape[1]
 
     pairs = sum(math.comb(len(coded.levels), 2) for coded in coded_unknowns)
     effects = []
     first_column = 1
     for coded in coded_unknowns:
         end_column = first_column + coded.codes.shape[1]
-        rows = np.zeros((len(coded.levels), design.shape[1]))
+        rows = np.zeros((len(coded.levels), columns))
         rows[:, 0] = 1.0
         rows[:, first_column:end_column] = coded.codes
         first_column = end_column
@@ -127,13 +206,14 @@ def over_unknowns(record: SetUpRecord, draws: int = DRAWS) -> OverUnknowns | Non
     return OverUnknowns(tuple(effects), lowest_mm, highest_mm)
 
 
-def _resampled(targets: Targets, design: np.ndarray, fitted: np.ndarray, draws: int) -> np.ndarray:
+def _resampled(targets: Targets, boards: _Boards, fitted: np.ndarray, draws: int) -> np.ndarray:
     """Return the coefficients (draws, 2 k) of resampled boards, stretched about those of all boards
     ``fitted`` (1, 2 k)."""
+    _, first_target = np.unique(targets.board, return_index=True)
     blocks = []
     for (weights,) in weights_in_blocks(draws, (targets.board, "damaged")):
-        blocks.append(_fitted(targets, design, weights, fitted))
-    stretch = _stretch(len(np.unique(targets.board)), fitted.shape[1])
+        blocks.append(_fitted(boards, weights[:, first_target], fitted))
+    stretch = _stretch(len(boards.design), fitted.shape[1])
     return np.asarray(fitted + stretch * (np.concatenate(blocks) - fitted))
 
 
@@ -182,50 +262,33 @@ def _no_effects(targets: Targets, coded_unknowns: Sequence[_Coded]) -> str:
     return ""
 
 
-def _fitted(
-    targets: Targets, design: np.ndarray, weights: np.ndarray, start: np.ndarray | None
-) -> np.ndarray:
-    """Return the likeliest middles and widths (d, 2 k) of targets with ``weights`` (d, n), given
-    the columns (n, k) of their unknowns: coefficients of mu, then of ln s. ``start``: those of all
-    targets (1, 2 k), from which the search begins."""
-    log_size = np.log(targets.size_mm)
-    hits = weights * targets.hits
-    misses = weights * (targets.inspections - targets.hits)
-    columns = design.shape[1]
+def _fitted(boards: _Boards, weights: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+    """Return the likeliest middles and widths (d, 2 k) of boards with ``weights`` (d, boards):
+    coefficients of mu, then of ln s. ``start``: those of all boards (1, 2 k), from which the search
+    begins."""
+    columns = boards.design.shape[1]
+    inspections = boards.hits + boards.misses
     expected = np.zeros(2 * columns)
     expected[columns] = USUAL_WIDTH
     precision = np.full(2 * columns, 1 / SHIFT**2)
     precision[0] = 0.0
     precision[columns:] = 1 / WIDTH**2
-    precision *= targets.inspections.mean()  # repeats of the noise are no further targets
+    # repeats of the noise are no further targets
+    precision *= inspections[inspections > 0].mean()
 
     def climb(b: np.ndarray, studies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return log-posteriors and scoring steps at b (d, 2 k), for `ascend`."""
-        of_hits = hits[studies]
-        of_misses = misses[studies]
-        steepness = np.exp(-b[:, columns:] @ design.T)
-        middle = b[:, :columns] @ design.T
-        predictor = (log_size - middle) * steepness
-        log_hit, log_miss, _ = logs_of_link(LINK, predictor)
-        log_likelihood = (of_hits * log_hit + of_misses * log_miss).sum(axis=1)
+        value, gradient, information = boards.likelihood(b, weights[studies])
         departure = b - expected
-        value = log_likelihood - 0.5 * departure**2 @ precision
-
-        up, down, _ = slopes_of_link(LINK, predictor)
-        residual = of_hits * up - of_misses * down
-        weight = (of_hits + of_misses) * up * down
-        by_middle = -steepness[:, :, None] * design
-        by_log_width = -predictor[:, :, None] * design
-        slopes = np.concatenate([by_middle, by_log_width], axis=2)
-        gradient = (residual[:, None, :] @ slopes)[:, 0] - precision * departure
-        information = slopes.transpose(0, 2, 1) @ (weight[:, :, None] * slopes)
+        value = value - 0.5 * departure**2 @ precision
+        gradient = gradient - precision * departure
         information = information + np.diag(precision)
         step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
         return value, step
 
     if start is None:
         start = expected[None].copy()
-        start[0, 0] = log_size.mean()
+        start[0, 0] = boards.log_size[inspections > 0].mean()
         start[0, columns] = 0.0  # wide: every target tells something
     begin = np.repeat(start, len(weights), axis=0)
     fitted, _ = ascend(climb, begin, 1e-5)

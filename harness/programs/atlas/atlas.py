@@ -65,7 +65,7 @@ def main(options: argparse.Namespace, command: str) -> int:
         else:
             to_make.append(planned)
     if options.dry_run:
-        _list(to_make, options.out)
+        _list(to_make, options.out, 1 if run_options.serial else run_options.jobs)
         return 0
     try:
         with engine_of(run_options, {DETECTOR}, renders_of(options.out)) as engine:
@@ -90,7 +90,7 @@ def main(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def _list(to_make: list[Planned], out: Path) -> None:
+def _list(to_make: list[Planned], out: Path, processes: int) -> None:
     """Print the work on each camera, and what all is expected to cost."""
     from harness.programs.atlas.making import EXPERIMENT, Work
     from harness.runs.bill import expected
@@ -104,8 +104,8 @@ def _list(to_make: list[Planned], out: Path) -> None:
             trials=total.trials + work.trials,
         )
         print(f"{_named(planned.names)}: {_in_words(work)}", flush=True)
-    cost = expected(out, EXPERIMENT, total.renders, total.trials)
-    print(f"in all: {_in_words(total)}{f'; {cost}' if cost else ''}")
+    cost = expected(out, EXPERIMENT, total.renders, total.trials, processes)
+    print(f"in all: {_in_words(total)}; {cost}")
 
 
 def _summary(shard: CameraLimits) -> list[str]:

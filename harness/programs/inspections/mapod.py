@@ -197,7 +197,7 @@ class Transfer:
         simulated_hits = stream.random((DRAWS, len(self.size))) < np.exp(log_hit[nodes])
         campaigns = np.vstack([self.hit, simulated_hits])
         statistic = []
-        blocks = -(-len(campaigns) * len(weight) // (CELLS * 64))  # bounds the memory
+        blocks = -(-len(campaigns) * len(weight) // (CELLS * 256))  # bounds the memory
         for block in np.array_split(campaigns, blocks):
             value = block @ log_hit.T + ~block @ missed.T
             relative = np.exp(value - value.max(axis=1, keepdims=True))

@@ -131,6 +131,14 @@ def test_what_renders_is_loaded_only_where_a_render_is_expected(monkeypatch):
     assert started == [both, both[:1]]
 
 
+def test_what_statistics_need_is_loaded_once_for_all_processes(monkeypatch):
+    started = []
+    monkeypatch.setattr(processes, "start_server", started.append)
+    with LocalEngine(1, Limits(), renders=False, further=("pandas",)):
+        pass
+    assert started == [("harness.trials.trial", "pandas")]
+
+
 OTHER_FOLDER = """
 from harness.runs.processes import LocalEngine
 from harness.runs.jobs import Job, Limits

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from harness.evaluation.intervals import percentiles
+from harness.evaluation.pod.curve import link_cdf
 from harness.evaluation.study import unknowns
+from harness.evaluation.study.boards import targets_of
 from harness.evaluation.study.record import read_record, record_text
 from harness.evaluation.study.unknowns import over_unknowns
 from tests.support.drawn_unknowns import (
@@ -89,6 +91,51 @@ def test_intervals_cover_the_truth():
         beyond_chance += by_key[BACKING].beyond_chance
     assert covered.min() >= 31
     assert beyond_chance >= 36
+
+
+def _row_by_row(targets, columns, b, weights):
+    """The log-likelihood of weighted targets, its gradient and the expected information at b
+    (2 k,), target by target."""
+    k = columns.shape[1]
+    value = 0.0
+    gradient = np.zeros(2 * k)
+    information = np.zeros((2 * k, 2 * k))
+    for row, size_mm in enumerate(targets.size_mm):
+        width = np.exp(columns[row] @ b[k:])
+        predictor = (np.log(size_mm) - columns[row] @ b[:k]) / width
+        hit = float(link_cdf("logit", predictor))
+        hits = targets.hits[row]
+        inspections = targets.inspections[row]
+        slope = np.concatenate([-columns[row] / width, -columns[row] * predictor])
+        log_likelihood = hits * np.log(hit) + (inspections - hits) * np.log1p(-hit)
+        value += weights[row] * log_likelihood
+        gradient += weights[row] * (hits - inspections * hit) * slope
+        information += weights[row] * inspections * hit * (1 - hit) * np.outer(slope, slope)
+    return value, gradient, information
+
+
+def test_sums_over_boards_are_those_over_their_targets():
+    """Boards of one to three targets, inspected once or twice."""
+    inspected = drawn_set_up(boards=7).inspected
+    kept = inspected.hole.astype(int) <= inspected.board % 3 + 1
+    kept = np.concatenate([np.flatnonzero(kept), np.flatnonzero(kept)[:4]])
+    rows = (getattr(inspected, name)[kept] for name in ("board", "hole", "size_mm", "hit"))
+    targets = targets_of(*rows)
+    counts = np.bincount(targets.board.astype(int))
+    assert len(set(counts)) > 1 and len(set(targets.inspections)) > 1
+    coded = [unknowns._coded(unknown, targets.board) for unknown in drawn_set_up(boards=7).drawn]
+    boards = unknowns._Boards.of(targets, coded)
+    columns = np.hstack([np.ones((len(targets.board), 1)), *[part.columns for part in coded]])
+    stream = np.random.default_rng(1)
+    b = stream.normal(0.0, 0.3, (2, 2 * columns.shape[1]))
+    b[:, 0] += np.log(10.0)
+    weights = stream.integers(0, 3, (2, len(counts))).astype(float)
+    values = boards.likelihood(b, weights)
+    for study in range(2):
+        of_rows = weights[study, targets.board.astype(int)]
+        expected_values = _row_by_row(targets, columns, b[study], of_rows)
+        for value, expected in zip(values, expected_values, strict=True):
+            assert value[study] == pytest.approx(expected, rel=1e-10, abs=1e-12)
 
 
 def test_intervals_are_stretched_for_the_coefficients_that_the_boards_determine(monkeypatch):
