@@ -42,8 +42,8 @@ _LOG_CDF: dict[str, Function] = {
 }
 _MIRRORED = {"logit": "logit", "probit": "probit", "cloglog": "loglog", "loglog": "cloglog"}
 LINKS = tuple(_CDF)
-# curves times targets, or resampled boards times their targets, in one block: 1 MB per array
-CELLS = 2**17
+# curves times targets, or resampled boards times their targets, in one block: 256 kB per array
+CELLS = 2**15
 
 
 def link_cdf(link: str, t: np.ndarray) -> np.ndarray:
