@@ -102,6 +102,19 @@ def test_of_curves_that_are_only_shifted_the_best_size_is_within_the_rise() -> N
     assert candidates_mm(RANGE_MM)[width(of=shifted).best()] == pytest.approx(6.0, abs=0.1)
 
 
+def test_sizes_beyond_the_range_count_as_its_end() -> None:
+    """Curves whose a90 differ beyond the range only are not told from each other."""
+    flat = WeightedCurves(
+        links=("logit",),
+        log_sizes=(False,),
+        model=np.zeros(3, int),
+        mu=np.array([6.0, 12.0, 12.0]),
+        sigma=np.array([0.5, 3.0, 300.0]),
+        weight=np.array([0.5, 0.25, 0.25]),
+    )
+    assert 7.0 < candidates_mm(RANGE_MM)[width(of=flat).best()] < 9.0
+
+
 def test_an_interval_without_an_end_counts_as_wide() -> None:
     assert width(excess=np.inf).excess == WIDEST
 

@@ -86,9 +86,10 @@ def test_the_sizes_narrow_the_interval_of_a90_and_are_shared_out_among_boards():
     assert sizes_mm.shape[1] == 6
     assert (np.diff(sizes_mm, axis=1) >= 0).all()
     assert ((sizes_mm > 6.0) & (sizes_mm < 8.0)).all()
-    # the smallest of every board are smaller than the second smallest of any
-    assert sizes_mm[:, 0].max() <= sizes_mm[:, 1].min()
     assert (np.round(sizes_mm, 3) == sizes_mm).all()
+    for_two_mm = np.array(after(START, WIDE, Stub((8.0, 9.0), (10.0, 12.0), "alike")).chosen_mm)
+    assert (for_two_mm[:, 0] < 8.0).all()
+    assert (for_two_mm[:, -1] > 9.0).all()
 
 
 def test_the_first_boards_have_no_chosen_sizes():
@@ -129,6 +130,8 @@ def test_a_batch_is_as_large_as_the_width_asks_for():
     hardly_wide = Stub((4.0, 5.0), (6.0, 6.51))
     assert boards(hardly_wide, Stub((8.0, 9.0), (10.0, 11.0), "other")) > LEAST_BATCH
     assert boards(WIDE) == 6
+    thirty = replace(START, chosen_mm=((3.0,) * 6,) * 24)
+    assert after(thirty, hardly_wide).boards == 36
     few_left = replace(twelve, most_boards=14)
     assert after(few_left, WIDE).boards == 14
 
