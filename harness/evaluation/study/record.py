@@ -333,7 +333,7 @@ class BoardDesign:
         return (
             f"{lead}The 95 % interval of a90 was to be at most {self.wanted} wide. Of "
             f"{self.boards} boards, {self.uniform_boards} have sizes over the whole range and "
-            f"{chosen} sizes in the intervals of a50 and a90 known before. No more boards: "
+            f"{chosen} the sizes that narrow the widest interval most. No more boards: "
             f"{self.reason}."
         )
 

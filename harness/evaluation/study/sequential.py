@@ -1,12 +1,9 @@
 """Studies with a stated precision: damaged boards come in batches until the 95 % interval of a90
 of every set-up is narrow enough.
 
-The sizes of the first boards are drawn over the whole range. A third of those of each later batch
-lies in the inner half of the interval of a50 and two thirds in that of a90, in turn of each set-up
-whose interval is still too wide; so all set-ups inspect the same boards, and an uncertain curve
-gets spread sizes. (With a known curve a tenth at a50 would do best: these thirds give 2.2 to 3.6
-times the information on a90 of sizes over seven times the distance from a50 to a90, a tenth and
-nine tenths 3.0 to 4.9 times, but one link's a90 alone.)
+The sizes of the first boards are drawn over the whole range. Each later size is the one that
+narrows most the interval that would then be the widest of all set-ups; so all set-ups inspect the
+same boards, which serve those that need them (`harness.evaluation.study.next_sizes`).
 
 An interval that is narrow by chance belongs to a curve that is too steep, and so to an a90 that is
 too small; therefore no study ends with its first boards. ``tofpod audit`` measures how often what
@@ -15,21 +12,20 @@ which no damaged board makes smaller, so that a study may end at its largest num
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import ceil
 
 import numpy as np
 
 from harness.evaluation.study.limit import SetUpLimit
+from harness.evaluation.study.next_sizes import ExpectedWidth, candidates_mm, even_candidate
 from harness.evaluation.study.record import BoardDesign
 
 FIRST_BOARDS = 6
 """Boards with sizes over the whole range: with eight damages each, their 48 sizes show a curve that
 rises within a tenth of the range."""
 LEAST_BATCH = 4  # boards: two for each core of a small machine
+LEAST_GROWTH = 0.2  # smallest batch over the boards before it: each look may end a study by chance
 MOST_GROWTH = 0.5  # largest batch over the boards before it: the sizes after it are better ones
 PATIENCE = 12  # boards after which a set-up without a curve is waited for no longer
-LEVELS = ("a50", "a90", "a90")  # sizes about these in turn
-DECIMALS = 3  # sizes are rounded to micrometres: no board hangs on the last digit of an interval
 
 
 def first_design(
@@ -68,8 +64,7 @@ def next_design(design: BoardDesign, limits: Sequence[SetUpLimit]) -> BoardDesig
         return _ended(design, without_curve)
     if design.boards >= design.most_boards:
         return _ended_at_most(design, wide, without_curve)
-    served = [*wide, *without_curve] if is_waiting else wide
-    chosen_mm = _batch_mm(design, served or with_curve)
+    chosen_mm = _batch_mm(design, wide or with_curve, without_curve if is_waiting else ())
     return replace(design, chosen_mm=design.chosen_mm + chosen_mm)
 
 
@@ -113,43 +108,37 @@ def _no_curve(without_curve: Sequence[SetUpLimit]) -> str:
     return f"{first.record.label}{suffix} has no curve: {outcome}"
 
 
-def _batch_mm(design: BoardDesign, served: Sequence[SetUpLimit]) -> tuple[tuple[float, ...], ...]:
-    """Choose the sizes of a batch of boards, in turn for each set-up and each of `LEVELS`."""
-    boards = _batch(design, served)
-    first = design.boards * design.per_board
-    sizes_mm = []
-    for number in range(first, first + boards * design.per_board):
-        turn, level = divmod(number, len(LEVELS))
-        limit = served[turn % len(served)]
-        sizes_mm.append(_size_mm(design, limit, LEVELS[level], number))
-    by_board = np.sort(np.reshape(sizes_mm, (boards, design.per_board)), axis=1)
-    return tuple(tuple(row) for row in by_board.tolist())
+def _batch_mm(
+    design: BoardDesign, with_curve: Sequence[SetUpLimit], without_curve: Sequence[SetUpLimit]
+) -> tuple[tuple[float, ...], ...]:
+    """Choose the sizes of a batch: as many boards as are expected to make the intervals of the
+    set-ups with a curve narrow enough, within bounds."""
+    widths = []
+    for limit in with_curve:
+        widths.append(ExpectedWidth(limit, design.range_mm, _excess(design, limit)))
+    least = max(LEAST_BATCH, int(LEAST_GROWTH * design.boards))
+    growth = max(least, int(MOST_GROWTH * design.boards))
+    most = min(growth, design.most_boards - design.boards)
+    boards = 0
+    chosen: list[int] = []
+    while boards < most and (boards < least or any(width.excess > 1 for width in widths)):
+        for hole in range(design.per_board):
+            number = (design.boards + boards) * design.per_board + hole
+            chosen.append(_next_candidate(widths, len(without_curve), number))
+        boards += 1
+    # each board gets sizes for all set-ups, so that its luck counts as little as can be in each
+    sizes_mm = candidates_mm(design.range_mm)[np.sort(chosen)].tolist()
+    return tuple(tuple(sizes_mm[board::boards]) for board in range(boards))
 
 
-def _batch(design: BoardDesign, served: Sequence[SetUpLimit]) -> int:
-    """Return the number of boards of a batch: as many as an interval needs whose width falls with
-    the root of the boards, within bounds."""
-    needed = design.boards * max(_excess(design, limit) for limit in served) ** 2
-    most = min(design.boards * (1 + MOST_GROWTH), design.most_boards)
-    boards = ceil(min(needed, most)) - design.boards
-    return min(max(boards, LEAST_BATCH), design.most_boards - design.boards)
-
-
-def _size_mm(design: BoardDesign, limit: SetUpLimit, level: str, number: int) -> float:
-    """Return a size in the inner half of the interval of a level; in the whole range if there is
-    no curve."""
-    low_mm, high_mm = design.range_mm
-    interval = limit.a90_interval_mm if level == "a90" else limit.a50_interval_mm
-    if limit.statement is not None and interval.known:
-        estimate_mm = limit.a90_mm if level == "a90" else limit.a50_mm
-        ends_mm = np.clip([interval.low, estimate_mm, interval.high], low_mm, high_mm)
-        low_mm, high_mm = ((ends_mm[:-1] + ends_mm[1:]) / 2).tolist()
-    size_mm = low_mm + (high_mm - low_mm) * _even(number)
-    return float(np.clip(round(size_mm, DECIMALS), *design.range_mm))
-
-
-def _even(number: int) -> float:
-    """Return a number from 0 to 1; each run of consecutive ones is spread evenly, also every third
-    (multiples of the golden section; Weyl 1916)."""
-    golden = (np.sqrt(5.0) - 1.0) / 2.0
-    return float((number * golden) % 1.0)
+def _next_candidate(widths: Sequence[ExpectedWidth], without_curve: int, number: int) -> int:
+    """Choose the size of damage ``number`` and add it to the expected ``widths``. Set-ups without
+    a curve get sizes over the whole range, each in its turn."""
+    turns = without_curve + bool(widths)
+    if number % turns < without_curve:
+        candidate = even_candidate(number)
+    else:
+        candidate = max(widths, key=lambda width: width.excess).best()
+    for width in widths:
+        width.add(candidate)
+    return candidate
