@@ -118,9 +118,13 @@ class Quadrilaterals:
         c01 = self.corner[rows, cols + 1]
         c10 = self.corner[rows + 1, cols]
         c11 = self.corner[rows + 1, cols + 1]
-        axes = np.stack([c00, c01 - c00, c10 - c00, c00 - c01 - c10 + c11], axis=-1)
-        z = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(axes), 1, 4))
-        return np.concatenate([axes, z], axis=1)
+        axes = np.zeros((3, 4, len(rows)))
+        axes[:2, 0] = c00.T
+        axes[:2, 1] = (c01 - c00).T
+        axes[:2, 2] = (c10 - c00).T
+        axes[:2, 3] = (c00 - c01 - c10 + c11).T
+        axes[2, 0] = 1.0
+        return np.moveaxis(axes, 2, 0)
 
     def grid(self, side: int = COARSE) -> np.ndarray:
         """Return weights (k, side^2) of the centres of side x side cells of a pixel, row by row."""

@@ -1,7 +1,6 @@
 """Stores renders by content, in files with a checksum; lists, locks and trims their folder."""
 
 import contextlib
-import hashlib
 import io
 import json
 import os
@@ -9,10 +8,11 @@ import re
 import stat
 import time
 import zipfile
+import zlib
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -29,9 +29,9 @@ from scenes.target.custom import TargetConfig
 # them by 1e-6
 CODE = ("scenes.render.view", "scenes.target.mesh")
 PACKAGES = ("mitsuba", "drjit", "trimesh", "manifold3d", "numba", "numpy", "scipy")
-VIEW_VERSION = 2  # stored in every file; a file of another version counts as absent
+VIEW_VERSION = 3  # stored in every file; a file of another version counts as absent
 MOST_BYTES = 2 << 30  # a sensor of a million pixels at a hundred frequencies needs 1.7 GB
-CHECKSUM_BYTES = 16
+CHECKSUM_BYTES = 4  # any flipped byte or run of bytes changes them; BLAKE2 takes four times as long
 ARRAYS = tuple(f.name for f in fields(NoiseFreeView) if f.type == "np.ndarray")
 RENDER_NAME = re.compile(r"[0-9a-f]{16}\.npz")
 # names of renders being written, by `files`
@@ -107,14 +107,20 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in {"facts": np.array(json.dumps(facts)), **arrays}.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as part:
-                contiguous = np.asanyarray(array, order="C")
-                np.lib.format.write_array(part, contiguous, allow_pickle=False)
-    content = buffer.getvalue()
-    write_bytes(path, content + _checksum(content), durable=False)
+                _write_array(part, np.asanyarray(array, order="C"))
+    buffer.write(_checksum(buffer.getvalue()))
+    write_bytes(path, buffer.getvalue(), durable=False)
+
+
+def _write_array(file: IO[bytes], array: np.ndarray) -> None:
+    """Write an array as .npy, as `numpy.lib.format.write_array` does, without a copy of it."""
+    header = np.lib.format.header_data_from_array_1_0(array)
+    np.lib.format.write_array_header_1_0(file, header)
+    file.write(array.reshape(-1).view(np.uint8).data)
 
 
 def _checksum(content: bytes | memoryview) -> bytes:
-    return hashlib.blake2b(content, digest_size=CHECKSUM_BYTES).digest()
+    return zlib.crc32(content).to_bytes(CHECKSUM_BYTES, "little")
 
 
 def read_view(path: Path) -> NoiseFreeView | None:
@@ -130,11 +136,11 @@ def read_view(path: Path) -> NoiseFreeView | None:
         body = content[:-CHECKSUM_BYTES]
         if _checksum(body) != content[-CHECKSUM_BYTES:]:
             return None
-        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
-            facts = json.loads(str(archive["facts"]))
+        with zipfile.ZipFile(io.BytesIO(body)) as archive:
+            facts = json.loads(str(_array_in(archive, "facts")))
             if facts.pop("version") != VIEW_VERSION:
                 return None
-            arrays = {name: archive[name] for name in ARRAYS}
+            arrays = {name: _array_in(archive, name) for name in ARRAYS}
         facts["region"] = Region(**facts["region"])
         for name in ("frequencies_hz", "surface_names"):
             facts[name] = tuple(facts[name])
@@ -144,6 +150,19 @@ def read_view(path: Path) -> NoiseFreeView | None:
     with contextlib.suppress(OSError):  # a read-only cache works too
         os.utime(path)
     return view
+
+
+def _array_in(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Return a stored array, as `numpy.load` does, in half of its time. Raises ValueError for
+    objects."""
+    content = io.BytesIO(archive.read(f"{name}.npy"))
+    if np.lib.format.read_magic(content) != (1, 0):
+        raise ValueError(f"{name}: another version of the format")
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(content)
+    if is_fortran:
+        raise ValueError(f"{name}: columns first")
+    values = np.frombuffer(content.getbuffer(), dtype, offset=content.tell())
+    return values.reshape(shape).copy()
 
 
 @dataclass(frozen=True)

@@ -282,9 +282,11 @@ class _Sums:
 
         light = means.light
         face = means.face
-        self.phasor[:, pixels] = light[:-1:2] + 1j * light[1::2]
+        self.phasor.real[:, pixels] = light[:-1:2]
+        self.phasor.imag[:, pixels] = light[1::2]
         self.intensity[pixels] = light[-1]
-        self.face[:-1, pixels] = face[:-1:2] + 1j * face[1::2]
+        self.face.real[:-1, pixels] = face[:-1:2]
+        self.face.imag[:-1, pixels] = face[1::2]
         self.face[-1, pixels] = face[-1]
         self.coverage[pixels] = means.same
         self.face_range_m[pixels] = means.face_range_m / np.maximum(means.count, 1 / m)
@@ -311,12 +313,15 @@ class _Sums:
         n, _, k = axes.shape
         lanes_a_pixel = weights.shape[1] // A_LANE
         lanes = n * lanes_a_pixel
-        pixel, part = np.divmod(np.arange(lanes), lanes_a_pixel)
-        axis = [on_device(mi.Float, column[pixel]) for column in axes.reshape(n, -1).T]
+
+        def by_lane(values: np.ndarray) -> Any:
+            return on_device(mi.Float, np.repeat(values.astype(np.float32), lanes_a_pixel))
+
+        axis = [by_lane(column) for column in axes.reshape(n, -1).T]
         table = [on_device(mi.Float, row) for row in weights]
-        begin = on_device(mi.UInt32, part * A_LANE)
-        central_path_m = on_device(mi.Float, self.central.path_m[pixels][pixel])
-        central_surface = on_device(mi.Float, self.central.surface[pixels][pixel])
+        begin = on_device(mi.UInt32, np.tile(np.arange(lanes_a_pixel) * A_LANE, n))
+        central_path_m = by_lane(self.central.path_m[pixels])
+        central_surface = by_lane(self.central.surface[pixels])
         meet = self._on_planes(pixels, central_surface) if plane else self._cast
 
         def component(weight: list[Any], row: int) -> Any:
@@ -402,7 +407,9 @@ def _means(lanes: Any, by_lane: tuple[int, int]) -> np.ndarray:
     """Return the means over each pixel's sub-rays of an array or a list of arrays by lane."""
     if isinstance(lanes, list):
         return np.stack([_means(array, by_lane) for array in lanes])
-    sums = lanes.numpy().reshape(by_lane).sum(axis=1, dtype=float)
+    sums = lanes.numpy().astype(float)
+    if by_lane[1] > 1:
+        sums = sums.reshape(by_lane).sum(axis=1)
     sub_rays = by_lane[1] * A_LANE
     return np.asarray(sums / sub_rays)
 
@@ -538,10 +545,12 @@ def _corners(
     corner_light = _over_albedo(hits).reshape(h + 1, w + 1)
     corner_surface = hits.surface.reshape(h + 1, w + 1)
 
-    rays = np.concatenate([slopes, np.ones((h, w, 1))], axis=-1)
-    normal = central.normal.reshape(h, w, 3).astype(float)
+    normal_x, normal_y, normal_z = central.normal.reshape(h, w, 3).astype(float).transpose(2, 0, 1)
+    slope_x = slopes[..., 0]
+    slope_y = slopes[..., 1]
     range_m = central.range_m.reshape(h, w).astype(float)
-    height_m = range_m * (normal * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
+    along_normal = normal_x * slope_x + normal_y * slope_y + normal_z
+    height_m = range_m * along_normal / np.sqrt(slope_x * slope_x + slope_y * slope_y + 1)
     light = _over_albedo(central).reshape(h, w)
     surface = central.surface.reshape(h, w)
     brightest = light.copy()
@@ -554,7 +563,7 @@ def _corners(
             y = corner[rows, cols, 1]
             length = np.sqrt(1 + x * x + y * y)
             with np.errstate(invalid="ignore", divide="ignore"):
-                along_normal = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]
+                along_normal = normal_x * x + normal_y * y + normal_z
                 off_m = np.abs(corner_range_m[rows, cols] - height_m * length / along_normal)
             bend_m = np.fmax(bend_m, off_m)
             edge |= corner_surface[rows, cols] != surface

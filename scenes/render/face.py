@@ -47,9 +47,11 @@ def face_light(
     """Return the indirect light (f + 1, n) by way of the face (without its holes) in the pixels
     that see any of it, in the order of `numpy.nonzero` of ``direct.face[-1]``, and its noise of
     range (n,) in metres."""
-    sees_face = direct.face[-1].real > 0
-    rays = np.concatenate([slopes[sees_face], np.ones((int(sees_face.sum()), 1))], axis=-1)
-    rays *= (direct.face_range_m[sees_face] / np.linalg.norm(rays, axis=-1))[..., None]
+    pixels = np.flatnonzero(direct.face[-1].real > 0)
+    rays = np.ones((len(pixels), 3))
+    rays[:, :2] = slopes.reshape(-1, 2)[pixels]
+    lengths = np.sqrt(rays[:, 0] ** 2 + rays[:, 1] ** 2 + 1)
+    rays *= (direct.face_range_m.ravel()[pixels] / lengths)[:, None]
     x_m, y_m, _ = transform_points(invert(target.T_camera_board), rays).T
     node_x_m = _node_line_m(x_m, config.face_spacing_mm * MM)
     node_y_m = _node_line_m(y_m, config.face_spacing_mm * MM)
@@ -76,8 +78,8 @@ def face_light(
         np.ascontiguousarray(np.moveaxis(deviations, 2, 0), complex),
         np.array(lines),
         range_weights(tuple(work.frequencies_hz[line] for line in lines)),
-        direct.face[:, sees_face],
-        direct.phasor[:, sees_face],
+        direct.face.reshape(len(direct.face), -1)[:, pixels],
+        direct.phasor.reshape(len(direct.phasor), -1)[:, pixels],
     )
 
 

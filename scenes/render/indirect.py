@@ -283,9 +283,11 @@ def _gather(
     chunks = []
     for begin in range(0, lanes.shape[1], at_once):
         chunks.append(walk.sums(lanes[:, begin : begin + at_once]))
-    sums = np.add.reduceat(np.concatenate(chunks, axis=1), first_lanes, axis=1)
-    light = sums.reshape(lines + 1, len(samples), BATCHES) / per_batch[:, None]
-    return np.ascontiguousarray(np.moveaxis(light, 2, 0), np.complex64)
+    sums = chunks[0] if len(chunks) == 1 else np.concatenate(chunks, axis=1)
+    if len(first_lanes) < lanes.shape[1]:
+        sums = np.add.reduceat(sums, first_lanes, axis=1)
+    by_batch = np.moveaxis(sums.reshape(lines + 1, len(samples), BATCHES), 2, 0)
+    return np.asarray(by_batch * (1 / per_batch), np.complex64, order="C")
 
 
 class _Walk:
@@ -353,9 +355,12 @@ class _Walk:
 
         totals = dr.while_loop(state, unfinished, step, label="walk")[-1]
         dr.eval(totals)
-        values = [total.numpy() for total in totals]
-        phasors = [values[2 * line] + 1j * values[2 * line + 1] for line in range(lines)]
-        return np.stack([*phasors, values[-1]])
+        sums = np.zeros((lines + 1, n), np.complex64)
+        for line in range(lines):
+            sums.real[line] = totals[2 * line].numpy()
+            sums.imag[line] = totals[2 * line + 1].numpy()
+        sums.real[-1] = totals[-1].numpy()
+        return sums
 
     def _next_vertex(
         self,

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 
 from harness.vocabulary import system
 from harness.vocabulary.errors import UserError
@@ -280,15 +279,18 @@ def lit_scene(
     face; None means none."""
     import drjit as dr
 
-    joined: Any = trimesh.util.concatenate([part.mesh for part in parts])
-    vertices = np.asarray(joined.vertices, np.float32)
-    faces = np.asarray(joined.faces, np.uint32)
+    vertices = np.concatenate([part.mesh.vertices for part in parts])
+    vertex_counts = [len(part.mesh.vertices) for part in parts]
+    first_vertices = np.cumsum(vertex_counts) - vertex_counts
+    faces = np.concatenate(
+        [part.mesh.faces + first for part, first in zip(parts, first_vertices, strict=True)]
+    )
     mesh = mi.Mesh("target", len(vertices), len(faces))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = vertices.ravel()
-    parameters["faces"] = faces.ravel()
+    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
     parameters.update()
-    corners = np.asarray(joined.vertices)[joined.faces]
+    corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(
         np.linalg.norm(

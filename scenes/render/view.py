@@ -30,6 +30,8 @@ NEAR_PX = 3
 HOLE_RIM_PX = 1  # on both sides of a hole's rim, pixels are sampled finely
 # damage that may lie between a pixel's corners and its centre
 NARROW = ("through", "blind", "slot", "gouge", "chip")
+# a face's slope is at most 4 / 3, so that lengths on it are at most 5 / 3 of those in plan
+NEARBY = 2.0
 FIRST_SAMPLES = 32  # paths of each pixel inside the outline before it is known how many are needed
 # the pixels around a pixel, without it, whose first paths show how many it needs: 768 paths seldom
 # miss bright light
@@ -140,14 +142,26 @@ def _at_holes(
         centre = hole.centre_camera_m
         axis = hole.axis_camera
         rim_m = HOLE_RIM_PX * float(centre[2]) / min(lens.fx, lens.fy)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            on_plane = rays * ((centre @ axis) / (rays @ axis))[..., None]
-        x_m, y_m, _ = np.moveaxis(transform_points(T_board_camera, on_plane), -1, 0)
         chamfer_m = declared.reach_mm * MM - hole.reach_m
+        near = _around(slopes, centre, NEARBY * (hole.reach_m + rim_m + chamfer_m))
+        near_rays = rays[near]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            on_plane = near_rays * ((centre @ axis) / (near_rays @ axis))[:, None]
+        x_m, y_m, _ = transform_points(T_board_camera, on_plane).T
         in_mouth = hole.within(x_m, y_m, rim_m + chamfer_m)
         off_rim = hole.within(x_m[in_mouth], y_m[in_mouth], -rim_m)
-        closeness[in_mouth] = np.maximum(closeness[in_mouth], 2 - off_rim)
+        near[near] = in_mouth
+        closeness[near] = np.maximum(closeness[near], 2 - off_rim)
     return closeness
+
+
+def _around(slopes: np.ndarray, centre: np.ndarray, radius_m: float) -> np.ndarray:
+    """Return which rays (h, w) may come within a radius of a point (3,) before the lens: no point
+    of that ball is farther off the centre's slope."""
+    slope = centre[:2] / centre[2]
+    farthest = radius_m * np.sqrt(1 + slope @ slope) / max(centre[2] - radius_m, 1e-9)
+    off = np.abs(slopes - slope)
+    return np.asarray((off[..., 0] <= farthest) & (off[..., 1] <= farthest))
 
 
 def indirect_light(
@@ -218,19 +232,23 @@ def _light_in_pixels(
 
     ``total`` (f, p): all other light."""
     rays = direct.off_face
-    share = rays.share
     first = min(FIRST_SAMPLES, config.hole_samples)
     samples = np.where(within, first, config.rest_samples)
     light = gather_in_pixels(lit, rays, work, samples)
-    mean = light.mean(axis=0, dtype=complex)
-    batches = share * light[:, noise_lines(work.frequencies_hz)]
-    noise_m = range_noise_m(batches, total + share * mean[:-1], work.frequencies_hz)
-    expected_m = _expected_noise_m(direct, total, within, mean[0], noise_m)
+    inner = light[..., within]
+    share = rays.share[within]
+    mean = inner.mean(axis=0, dtype=complex)
+    batches = share * inner[:, noise_lines(work.frequencies_hz)]
+    other_light = total[:, within]
+    noise_m = range_noise_m(batches, other_light + share * mean[:-1], work.frequencies_hz)
+    expected_m = _expected_noise_m(
+        direct.range_m.shape, rays.pixel[within], other_light[0] / share, mean[0], noise_m
+    )
 
     wanted = (expected_m / (config.hole_noise_mm * MM)) ** 2
     doublings = np.ceil(np.log2(np.clip(wanted, 1, config.hole_samples)) - 0.5)
-    samples = np.clip(first * 2**doublings, first, config.hole_samples)
-    samples = np.where(within, samples, 0).astype(np.int64)
+    samples = np.zeros(len(within), np.int64)
+    samples[within] = np.clip(first * 2**doublings, first, config.hole_samples)
     noisy = samples > first
     if noisy.any():
         additional = gather_in_pixels(
@@ -241,29 +259,28 @@ def _light_in_pixels(
 
 
 def _expected_noise_m(
-    direct: DirectLight,
-    total: np.ndarray,
-    within: np.ndarray,
+    shape: tuple[int, ...],
+    pixels: np.ndarray,
+    other_light: np.ndarray,
     mean: np.ndarray,
     noise_m: np.ndarray,
 ) -> np.ndarray:
-    """Return the noise of range (p,) to expect in pixels off the face, from the pixels around
+    """Return the noise of range (n,) to expect in pixels off the face, from the pixels around
     them.
 
     A pixel's own paths do not decide: those that missed rare bright light would end too soon, and
     the mean would be biased. Noise of range times the light is noise of the light; the mean of its
     square over the pixels around, over the light that they suggest, is noise of range again.
 
-    ``total`` (f, p): all other light. ``within`` (p,): which pixels count. ``mean`` (p,): indirect
-    phasors at the first frequency. ``noise_m`` (p,): their noise."""
-    rays = direct.off_face
-    other_light = total[0] / rays.share
+    ``pixels`` (n,): flat indices in an image of this shape. ``other_light`` (n,): all other
+    phasors at the first frequency, over the share of the footprint off the face. ``mean`` (n,):
+    indirect ones. ``noise_m`` (n,): the noise of range."""
     light_variance = (noise_m * np.abs(other_light + mean)) ** 2
-    values = np.stack([within, light_variance, mean.real, mean.imag], axis=-1)
-    image = np.zeros((*direct.range_m.shape, 4))
-    image.reshape(-1, 4)[rays.pixel[within]] = values[within]
+    image = np.zeros((*shape, 4))
+    counted = np.ones(len(pixels))
+    image.reshape(-1, 4)[pixels] = np.stack([counted, light_variance, mean.real, mean.imag], -1)
     sums = cv2.filter2D(image, -1, AROUND, borderType=cv2.BORDER_CONSTANT)
-    sums = sums.reshape(-1, 4)[rays.pixel]
+    sums = sums.reshape(-1, 4)[pixels]
     count, variance, real, imaginary = (sums / np.maximum(sums[:, :1], 1)).T
     expected_m = np.sqrt(variance) / np.maximum(np.abs(other_light + real + 1j * imaginary), 1e-30)
     return np.where(count > 0, expected_m, noise_m)
