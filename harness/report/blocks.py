@@ -208,8 +208,8 @@ def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
     if bill is None:
         if not seconds:
             return [paragraph("Not recorded.")]
-        rows = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
-        return [Grid.of(("stage", "seconds"), rows).html()]
+        stages = [(stage, f"{float(value):.1f}") for stage, value in seconds.items()]
+        return [Grid.of(("stage", "seconds"), stages).html()]
     by_phase = bill() if callable(bill) else bill
     total_s = sum(by_phase.values())
     rows = []
