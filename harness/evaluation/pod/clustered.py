@@ -28,7 +28,7 @@ from harness.evaluation.pod.averaged import (
     log_weights,
     weighted_quantile,
 )
-from harness.evaluation.pod.curve import Bound, link_cdf, link_ppf, log_likelihoods
+from harness.evaluation.pod.curve import CELLS, Bound, link_cdf, link_ppf, log_likelihoods
 from harness.evaluation.pod.hit_miss import HitMissFit
 
 METHOD = "average over models and clusters"
@@ -231,10 +231,14 @@ def _of_clusters(
     misses = np.bincount(row, fit.data.misses) / fit.repeats
     _, starts = np.unique(rows[:, 0], return_index=True)
     values = np.empty((len(widths), len(starts), len(middles)))
-    for number, width in enumerate(widths):
-        predictor = half + (high - low) * (rows[:, 1:] - middles) / width
-        of_rows = log_likelihoods(fit.curve.link, predictor, hits, misses)
-        values[number] = np.add.reduceat(of_rows, starts)
+    block = max(1, CELLS // len(rows))
+    for first in range(0, len(middles), block):
+        part = slice(first, first + block)
+        distances = (high - low) * (rows[:, 1:] - middles[part])
+        for number, width in enumerate(widths):
+            predictor = half + distances / width
+            of_rows = log_likelihoods(fit.curve.link, predictor, hits, misses)
+            values[number, :, part] = np.add.reduceat(of_rows, starts)
     return values
 
 
