@@ -212,9 +212,9 @@ def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
         return [Grid.of(("stage", "seconds"), rows).html()]
     by_phase = bill() if callable(bill) else bill
     total_s = sum(by_phase.values())
-    rows = []
+    phases = []
     for phase, phase_s in [*by_phase.items(), ("in all", total_s)]:
-        rows.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
+        phases.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
     counts = []
     for name in ("renders", "trials"):
         if name in provenance:
@@ -226,7 +226,7 @@ def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
         f"Processor seconds of all processes of this run.{done} what was stored before costs "
         f"nothing here.{took}"
     )
-    return [Grid.of(("phase", "processor seconds", "share"), rows).html(), note(explained)]
+    return [Grid.of(("phase", "processor seconds", "share"), phases).html(), note(explained)]
 
 
 def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:
