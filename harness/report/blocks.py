@@ -214,16 +214,16 @@ def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
     total_s = sum(by_phase.values())
     phases = []
     for phase, phase_s in [*by_phase.items(), ("in all", total_s)]:
-        phases.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
+        phases.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / max(total_s, 0.01):.0f} %"))
     counts = []
     for name in ("renders", "trials"):
         if name in provenance:
             counts.append(f"{provenance[name]['done']} {name}")
-    done = f" {' and '.join(counts)} were done;" if counts else ""
+    work = f", for {' and '.join(counts)}" if counts else ""
     wall_s = seconds.get("this run in all")
     took = f" It took {float(wall_s):.0f} s before this page was drawn." if wall_s else ""
     explained = (
-        f"Processor seconds of all processes of this run.{done} what was stored before costs "
+        f"Processor seconds of all processes of this run{work}. What was stored before costs "
         f"nothing here.{took}"
     )
     return [Grid.of(("phase", "processor seconds", "share"), phases).html(), note(explained)]
