@@ -212,21 +212,21 @@ def _cost(provenance: Mapping[str, Any]) -> list[Markup]:
         return [Grid.of(("stage", "seconds"), stages).html()]
     by_phase = bill() if callable(bill) else bill
     total_s = sum(by_phase.values())
-    rows = []
+    phases = []
     for phase, phase_s in [*by_phase.items(), ("in all", total_s)]:
-        rows.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / total_s:.0f} %"))
+        phases.append((phase, f"{phase_s:.1f}", f"{100 * phase_s / max(total_s, 0.01):.0f} %"))
     counts = []
     for name in ("renders", "trials"):
         if name in provenance:
             counts.append(f"{provenance[name]['done']} {name}")
-    done = f" {' and '.join(counts)} were done;" if counts else ""
+    work = f", for {' and '.join(counts)}" if counts else ""
     wall_s = seconds.get("this run in all")
     took = f" It took {float(wall_s):.0f} s before this page was drawn." if wall_s else ""
     explained = (
-        f"Processor seconds of all processes of this run.{done} what was stored before costs "
+        f"Processor seconds of all processes of this run{work}. What was stored before costs "
         f"nothing here.{took}"
     )
-    return [Grid.of(("phase", "processor seconds", "share"), rows).html(), note(explained)]
+    return [Grid.of(("phase", "processor seconds", "share"), phases).html(), note(explained)]
 
 
 def _failures(failures: Iterable[Mapping[str, str]]) -> list[Markup]:

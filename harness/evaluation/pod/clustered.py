@@ -232,10 +232,11 @@ def _of_clusters(
     _, starts = np.unique(rows[:, 0], return_index=True)
     values = np.empty((len(widths), len(starts), len(middles)))
     block = max(1, CELLS // len(rows))
-    for number, width in enumerate(widths):
-        for first in range(0, len(middles), block):
-            part = slice(first, first + block)
-            predictor = half + (high - low) * (rows[:, 1:] - middles[part]) / width
+    for first in range(0, len(middles), block):
+        part = slice(first, first + block)
+        distances = (high - low) * (rows[:, 1:] - middles[part])
+        for number, width in enumerate(widths):
+            predictor = half + distances / width
             of_rows = log_likelihoods(fit.curve.link, predictor, hits, misses)
             values[number, :, part] = np.add.reduceat(of_rows, starts)
     return values

@@ -238,12 +238,14 @@ def state_hits(
     log_size: bool | None = None,
     unit: str = "",
     tested: bool = True,
+    each_test: bool = True,
 ) -> PodStatement:
     """State the curve of hits and misses: the fit with the least deviance, over all links and over
     sizes or their logarithms, unless ``link`` or ``log_size`` restricts them. The bound is that of
     the average over the `near_models` among these fits, or the handbook's likelihood ratio bound
     if the user states both. ``tested``: whether to test for hits by chance and misses at any size,
-    which takes most of the time."""
+    which takes most of the time. Not ``each_test``: tests that cannot
+    lead to a note may be left out."""
     size = read.size
     # L-BFGS-B solves tiny systems with LAPACK, whose threads wait for each other: 9 s instead of
     # 0.6 s on busy cores
@@ -256,7 +258,7 @@ def state_hits(
         ]
         fit = allowed[0]
         close_fits = hit_miss.near_models(allowed)
-        tests = hit_miss.floor_ceiling_tests(fit) if tested else ()
+        tests = hit_miss.floor_ceiling_tests(fit, each=each_test) if tested else ()
         average: ModelAverage | None = None
         if len(allowed) > 1:
             average = ModelAverage(close_fits)

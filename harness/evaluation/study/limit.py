@@ -194,7 +194,7 @@ def _statement(record: SetUpRecord, tested: bool) -> tuple[PodStatement | None, 
     if not len(inspected.hit):
         return None, "no damage was inspected"
     try:
-        statement = state_hits(_rows(record), unit="mm", tested=tested)
+        statement = state_hits(_rows(record), unit="mm", tested=tested, each_test=False)
     except UserError as error:
         return None, error.message
     if inspected.limit_of == "depth" or not depth_varies(inspected.depth_mm):

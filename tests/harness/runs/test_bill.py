@@ -68,7 +68,7 @@ def test_a_page_shows_each_phase_with_its_share():
     words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
     for row in ("imports 1.0 6 %", "renders 12.0 75 %", "detection 3.0 19 %", "in all 16.0 100 %"):
         assert row in words
-    assert "2 renders and 5 trials were done" in words and "It took 12 s" in words
+    assert "of this run, for 2 renders and 5 trials. What was" in words and "It took 12 s" in words
     assert words.count("imports") == 1  # not once more among versions
 
 

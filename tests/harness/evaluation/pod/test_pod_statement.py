@@ -102,6 +102,23 @@ def _columns(read: Inspections) -> tuple[np.ndarray, np.ndarray]:
     return read.size, read.response
 
 
+@pytest.mark.parametrize("ends", [(0.0, 1.0), (0.0, 0.85), (0.2, 1.0)])
+def test_what_is_left_out_is_not_needed(ends: tuple[float, float]) -> None:
+    """One test suffices where it already excludes a floor and a ceiling; else all are made."""
+    left_out = 0
+    for seed in range(3):
+        read = hits_of(80, seed, *ends)
+        fit = fit_hit_miss(*_columns(read))
+        tests = floor_ceiling_tests(fit)
+        fewer = floor_ceiling_tests(fit, each=False)
+        if len(fewer) == 1:
+            assert fewer == tests[2:] and not any(test.needed for test in tests)
+            left_out += 1
+        else:
+            assert fewer == tests
+    assert left_out >= 1 if ends == (0.0, 1.0) else left_out < 3
+
+
 def test_separated_data_have_no_test() -> None:
     size = np.arange(1.0, 13.0)
     assert floor_ceiling_tests(fit_hit_miss(size, size > 6)) == ()
