@@ -505,13 +505,13 @@ def _added(  # type: ignore[no-untyped-def]
         count[i] += used[i]
         total[i] += deviation
         squares[i] += deviation * deviation
-    for i in np.flatnonzero(~used):
-        if not np.isfinite(z[i]):
-            reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
-        elif np.isnan(offset[i]):
-            offset[i] = z[i]
-            used[i] = True
-            count[i] += 1
+    for pixel in np.flatnonzero(~used):
+        if not np.isfinite(z[pixel]):
+            reasons[reason[pixel] if reason[pixel] > 0 else NOT_FINITE, pixel] += 1
+        elif np.isnan(offset[pixel]):
+            offset[pixel] = z[pixel]
+            used[pixel] = True
+            count[pixel] += 1
     return used
 
 
