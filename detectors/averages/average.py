@@ -267,11 +267,11 @@ class FrameSums:
         unchanged = np.count_nonzero(np.abs(differences - shift) <= self.change_m)
         return shift, (len(self.sample) - unchanged) / len(self.sample)
 
-    def _fault(self, frame: Frame) -> str | None:
-        """Return why this frame does not belong; None if it does."""
+    def _fault(self, z_m: np.ndarray) -> str | None:
+        """Return why a frame of z (n,) does not belong; None if it does."""
         if len(self.sample) == 0:
             return None
-        shift, fraction = self._change(frame.z_m.ravel())
+        shift, fraction = self._change(z_m)
         against = "the first frame"
         if self.reference_frames > 2:
             against = f"the first {self.reference_frames} frames"
@@ -293,11 +293,11 @@ class FrameSums:
     def take(self, frame: Frame) -> None:
         """Add one frame (h, w), or leave it out. Raises UserError if the median's memory is too
         small."""
-        fault = self._fault(frame) if self.config.judge_frames else None
+        z_m = frame.z_m.ravel()
+        fault = self._fault(z_m) if self.config.judge_frames else None
         if fault is not None:
             self.left_out.append(LeftOut(frame.name, fault))
             return
-        z_m = frame.z_m.ravel()
         if self.config.method == "median":
             self._refuse_memory(frame)
             self.stack.append(z_m.astype(np.float32))
@@ -428,6 +428,8 @@ def _one_scene(stack: np.ndarray, change_m: float) -> np.ndarray:
     samples = blocks.transpose(0, 1, 3, 2, 4).reshape(len(stack), rows * columns, -1)
     is_same = np.eye(len(stack), dtype=bool)
     for i, j in combinations(range(len(stack)), 2):
+        if i > 0 and is_same[0].all():
+            break  # no frame agrees with more than the first one, which was compared with all
         is_same[i, j] = _changed_share(samples[i], samples[j], change_m) < OTHER_SCENE
         is_same[j, i] = is_same[i, j]
     return is_same[int(np.argmax(is_same.sum(axis=1)))]
@@ -503,15 +505,13 @@ def _added(  # type: ignore[no-untyped-def]
         count[i] += used[i]
         total[i] += deviation
         squares[i] += deviation * deviation
-    for i in range(len(z)):
-        if used[i]:
-            continue
-        if not np.isfinite(z[i]):
-            reasons[reason[i] if reason[i] > 0 else NOT_FINITE, i] += 1
-        elif np.isnan(offset[i]):
-            offset[i] = z[i]
-            used[i] = True
-            count[i] += 1
+    for pixel in np.flatnonzero(~used):
+        if not np.isfinite(z[pixel]):
+            reasons[reason[pixel] if reason[pixel] > 0 else NOT_FINITE, pixel] += 1
+        elif np.isnan(offset[pixel]):
+            offset[pixel] = z[pixel]
+            used[pixel] = True
+            count[pixel] += 1
     return used
 
 

@@ -11,11 +11,9 @@ import numpy as np
 from scipy import ndimage
 
 from scenes.sensor.amcw import ranging
-from scenes.sensor.amcw.linear import DEVIATIONS, Filtered
+from scenes.sensor.amcw.linear import DEVIATIONS, MOST_HIGHER, Filtered
 
 f4 = np.float32
-# most variance not of first order: it is then right to 1 %; beyond, frames are simulated
-MOST_HIGHER = 0.025
 # in place of an unknown deviation: of a phase in radians, of an amplitude in units
 LARGEST_PHASE_NOISE = 1e3
 LARGEST_AMPLITUDE_NOISE = 1e9

@@ -16,22 +16,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw.certainty import Certainty, certainty
 from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.exposure import AmcwExposure
-from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
+from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.light import Light, light_of_samples
 from scenes.sensor.amcw.linear import DEVIATIONS, Moves, linearised, unknown_filtered
 from scenes.sensor.amcw.linear_frames import TOGETHER, Linear, draw_linear_frame
 from scenes.sensor.amcw.listed import Listed, decoded, listed_of
 from scenes.sensor.amcw.windows import pixels_within, windows_of
-from scenes.sensor.common.normals import standard_normals
+from scenes.sensor.common.normals import FAST, standard_normals
 from scenes.sensor.common.unit import DecodedFrame
 
 f4 = np.float32
+ZERO = f4(0)
 RADIANS_PER_TURN = f4(2 * np.pi)
 # if more of the pixels had to go through the whole chain, whole frames would cost less
 MOST_LISTED = 0.3
@@ -166,7 +168,7 @@ def _metres_by_phase(imager: AmcwImager, light: Light) -> np.ndarray:
 
 def _halo_noise(light: Light, metres_by_phase: np.ndarray, halo: np.ndarray) -> HaloNoise:
     """Return what turns readings of ``halo`` (g,) pixels into normals."""
-    light = Light._make(part[:, halo] for part in light)
+    light = Light._make(part.take(halo, axis=1) for part in light)
     noise_m = metres_by_phase[:, halo] * light.phase_noise
     shares = noise_m / np.sqrt((noise_m**2).sum(axis=0))
     across = light.amplitude * light.phase_noise
@@ -211,18 +213,17 @@ def _linear(
     by_centre[pixels] = (by_own - space[middle, middle] * by_neighbours) / noise[pixels]
 
     # uneven pixels: a number for each neighbour, with the sign of the sum over the frequencies
-    always = certain.always[uneven.pixels]
+    always = np.flatnonzero(certain.always[uneven.pixels])
     pixels = uneven.pixels[always]
-    pulls_m = metres[:, :, None] * uneven.moves.phase[:, always]
-    size_m = np.copysign(np.sqrt((pulls_m**2).sum(axis=0)), pulls_m.sum(axis=0))
-    moves = size_m * by_path[pixels, None] / f4(step_m)
+    moves = joined_moves(uneven.moves.phase, always, metres[:, 0])
+    moves *= by_path[pixels, None]
+    moves /= f4(step_m)
     moves /= windows_of(noise.reshape(imager.region.shape), side, 1.0, pixels)
 
     # windows with zeros around them, up to an odd multiple of `TOGETHER`
     padded_side = 2 * TOGETHER * ((side + 4) // (2 * TOGETHER)) + TOGETHER
     rim = (padded_side - side) // 2
-    pulls = uneven.moves.amplitude[:, always]
-    amplitude_moves = np.copysign(np.sqrt((pulls**2).sum(axis=0)), pulls.sum(axis=0))
+    amplitude_moves = joined_moves(uneven.moves.amplitude, always, np.ones(len(metres), f4))
     amplitude_moves /= f4(len(metres))
     taps = np.pad(space[middle] / np.sqrt(space[middle, middle]), rim)
     z = np.where(certain.always, certain.z_m / f4(step_m), f4(np.nan))
@@ -241,6 +242,36 @@ def _linear(
         amplitude=certain.amplitude,
         amplitude_noise=certain.amplitude_deviation,
     )
+
+
+@numba.njit(**FAST)
+def joined_moves(moves, chosen, scales):  # type: ignore[no-untyped-def]
+    """Return the moves (p, k) float32 of the ``chosen`` (p,) pixels by their neighbours' noise, by
+    all frequencies together: as frequencies have independent noise, the root of the sum of squares,
+    with the sign of the sum.
+
+    Args:
+        moves: (f, m, k), those of each frequency.
+        chosen: (p,) indices of m.
+        scales: (f,) float32, factors of the frequencies.
+    """
+    neighbours = moves.shape[2]
+    joined = np.empty((chosen.size, neighbours), f4)
+    squares = np.empty(neighbours, f4)
+    total = np.empty(neighbours, f4)
+    for p in range(chosen.size):
+        squares[:] = ZERO
+        total[:] = ZERO
+        for f in range(len(moves)):
+            of_frequency = moves[f, chosen[p]]
+            for q in range(np.uint64(neighbours)):
+                move = scales[f] * of_frequency[q]
+                squares[q] += move * move
+                total[q] += move
+        of_pixel = joined[p]
+        for q in range(np.uint64(neighbours)):
+            of_pixel[q] = np.copysign(np.sqrt(squares[q]), total[q])
+    return joined
 
 
 def _padded(windows: np.ndarray, side: int, rim: int) -> np.ndarray:
@@ -278,9 +309,7 @@ class FirstOrder:
         amplitude = np.empty(n, f4)
         reading = imager.reading(listed.exposure, rng)
         normals = standard_normals(rng, (2, n))
-        of_phase, of_amplitude = self._normals_of(reading)
-        normals[0][listed.halo] = of_phase
-        normals[1][listed.halo] = of_amplitude
+        share_noise(reading.unit, reading.amplitude, self.halo_noise, listed.halo, normals)
         draw_linear_frame(
             self.shape,
             linear,
@@ -298,12 +327,28 @@ class FirstOrder:
         shape = self.shape
         return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude.reshape(shape))
 
-    def _normals_of(self, reading: NoisyLight) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normals (g,) of the phases and of the amplitudes of the list's halo."""
-        noise = self.halo_noise
-        g = len(self.listed.halo)
-        re, im = reading.unit[..., :g]
-        amplitude = reading.amplitude[:, :g]
-        across = (im * noise.turn_back.real + re * noise.turn_back.imag) * amplitude
-        longer = amplitude.sum(axis=0) - noise.mean_amplitude
-        return across.sum(axis=0), longer / noise.amplitude_noise
+
+@numba.njit(**FAST)
+def share_noise(unit, amplitude, noise, halo, normals):  # type: ignore[no-untyped-def]
+    """Write the normals of the phases and of the amplitudes of the list's halo, which linear pixels
+    share with it.
+
+    Args:
+        unit: (2, f, g or more) real and imaginary parts of a reading's unit phasors.
+        amplitude: (f, g or more) amplitudes of the reading.
+        noise: the `HaloNoise`.
+        halo: (g,) flat indices.
+        normals: (2, n) of the view; written at ``halo``.
+    """
+    frequencies = np.uint64(len(amplitude))
+    for x in range(np.uint64(halo.size)):
+        across = ZERO
+        total = ZERO
+        for f in range(frequencies):
+            turn_back = noise.turn_back[f, x]
+            turned = unit[1, f, x] * turn_back.real + unit[0, f, x] * turn_back.imag
+            across += turned * amplitude[f, x]
+            total += amplitude[f, x]
+        longer = total - noise.mean_amplitude[x]
+        normals[0, halo[x]] = across
+        normals[1, halo[x]] = longer / noise.amplitude_noise[x]

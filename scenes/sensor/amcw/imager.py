@@ -17,6 +17,7 @@ from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from scipy import ndimage, optimize, special
 
@@ -34,12 +35,14 @@ from scenes.sensor.amcw.facts import (
 from scenes.sensor.amcw.windows import windows_of
 from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.common.facts import Fact
-from scenes.sensor.common.normals import standard_normals
+from scenes.sensor.common.normals import IN_DOUBLE, standard_normals
 from scenes.sensor.common.unit import DecodedFrame, UnitModel, light_of, rays_of, smooth_field
 
 f4 = np.float32
 WIDE_PX = 1.5  # deviation from which samples of a Gaussian blur as it does, within 1 %
 LEAST_UNITS = 1.0  # sum of amplitudes of a view without light
+BLOCK = 512  # pixels of a block
+NEVER_ZERO = 1e-300
 HIGHEST_HARMONIC = 31  # higher harmonics change the phase by less than 0.1 mrad in total
 
 
@@ -54,22 +57,50 @@ def with_harmonics(signal: np.ndarray, phases: int, residual: np.ndarray) -> np.
     """
     # the odd harmonics that are aliased lie one below and one above multiples of this
     period = phases if phases % 2 == 0 else 2 * phases
-    changed = np.ones_like(signal)
-    # frequency by frequency, so that all stays in the processor's cache
-    for light, share, factor in zip(signal, residual, changed, strict=True):
-        direction = light / np.maximum(np.abs(light), 1e-300)
-        turned_by_period = direction.copy()
+    changed = np.empty_like(signal)
+    for light, share, with_them in zip(signal, residual, changed, strict=True):
+        _add_harmonics(light.ravel(), share, period, with_them.ravel())
+    return changed
+
+
+@numba.njit(**IN_DOUBLE)
+def _add_harmonics(light, share, period, changed):  # type: ignore[no-untyped-def]
+    """Write ``changed`` (n,): the light (n,) of one frequency with its aliased harmonics, which lie
+    one below and one above multiples of ``period``; in blocks, which stay in the processor's
+    cache."""
+    direction = np.empty(BLOCK, np.complex128)
+    turned_by_period = np.empty(BLOCK, np.complex128)
+    power = np.empty(BLOCK, np.complex128)
+    factor = np.empty(BLOCK, np.complex128)
+    for start in range(0, light.size, BLOCK):
+        size = min(BLOCK, light.size - start)
+        for i in range(size):
+            of_pixel = light[start + i]
+            length = np.sqrt(of_pixel.real**2 + of_pixel.imag**2)
+            per_length = 1 / max(length, NEVER_ZERO)
+            direction[i] = complex(of_pixel.real * per_length, of_pixel.imag * per_length)
+        turned_by_period[:size] = direction[:size]
         for _ in range(period - 1):
-            turned_by_period *= direction
-        power = np.ones_like(light)
+            _multiply(turned_by_period, direction, size)
+        power[:size] = 1
+        factor[:size] = 1
         for centre in range(period, HIGHEST_HARMONIC, period):
-            power *= turned_by_period
+            _multiply(power, turned_by_period, size)
             of_conjugate = share / (centre - 1) ** 2
             of_signal = share / (centre + 1) ** 2
-            factor.real += (of_signal + of_conjugate) * power.real
-            factor.imag += (of_signal - of_conjugate) * power.imag
-        factor *= light
-    return changed
+            along = of_signal + of_conjugate
+            across = of_signal - of_conjugate
+            for i in range(size):
+                factor[i] += complex(along * power[i].real, across * power[i].imag)
+        for i in range(size):
+            changed[start + i] = factor[i] * light[start + i]
+
+
+@numba.njit(**IN_DOUBLE)
+def _multiply(values, factors, n):  # type: ignore[no-untyped-def]
+    """Multiply the first n complex values by their factors, in place."""
+    for i in range(n):
+        values[i] *= factors[i]
 
 
 def scattered(image: np.ndarray, facts: ScatterFacts) -> np.ndarray:
@@ -203,17 +234,9 @@ class AmcwImager(UnitModel[AmcwCamera]):
 
     def expose(self, view: NoiseFreeView) -> AmcwExposure:
         """Return the noise-free samples of a view that covers this imager's region."""
-        scatter = self.camera.scatter
-        if scatter is not None:
-            view = replace(
-                view,
-                phasor=scattered(view.phasor, scatter),
-                phasor_direct=scattered(view.phasor_direct, scatter),
-                intensity=scattered(view.intensity, scatter),
-            )
         effects = self.config.effects
         photons = self.camera.photons
-        phasor, intensity = light_of(view, effects)
+        phasor, intensity = light_of(self._scattered(view), effects)
         electrons = photons.signal_electrons.value * self.gathered
         signal = self._demodulated(phasor, electrons)
         both_wells = electrons * intensity + self.ambient_electrons(view, intensity)
@@ -237,6 +260,18 @@ class AmcwImager(UnitModel[AmcwCamera]):
             time_share=time_share.ravel().astype(f4),
             shape=intensity.shape,
         )
+
+    def _scattered(self, view: NoiseFreeView) -> NoiseFreeView:
+        """Return a view after lens blur and stray light, whose phasors of all light and of direct
+        light are so changed only where `light_of` takes them."""
+        facts = self.camera.scatter
+        if facts is None:
+            return view
+        intensity = scattered(view.intensity, facts)
+        if self.config.effects.multipath:
+            return replace(view, phasor=scattered(view.phasor, facts), intensity=intensity)
+        direct = scattered(view.phasor_direct, facts)
+        return replace(view, phasor_direct=direct, intensity=intensity)
 
     def _time_shares(self, signal: np.ndarray, both_wells: np.ndarray) -> np.ndarray:
         """Return the exposure times (h, w) over the longest, in which the demodulated signal is

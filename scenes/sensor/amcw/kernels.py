@@ -356,17 +356,19 @@ def filter_strips(  # type: ignore[no-untyped-def]
     unit,
     amplitude,
     strips,
+    turned,
     settings,
     filtered,
     edge,
 ):
-    """Filter windows in strips as `filter_image` does.
+    """Filter windows in strips as `filter_image` does, neighbour by neighbour in the same order.
 
     Args:
         unit: (2, f, g) real and imaginary parts of unit phasors.
         amplitude: (f, g).
         strips: (side, s) indices of pixels; a window begins at each of the first s - side + 1
             columns.
+        turned: first column of windows whose columns are rows of the picture.
         settings: the `FilterSettings`.
         filtered: (f, 3, s - side + 1) as in `filter_image`; written, without meaning where the
             columns are not neighbours in the picture.
@@ -380,11 +382,17 @@ def filter_strips(  # type: ignore[no-untyped-def]
     rows[(3 * side + 2) * STRIDE :] = OUTSIDE
     space = _padded(settings.space)
     starts = np.full(space.size, np.uint64(3 * side * STRIDE))
-    for q in range(side * side):
-        starts[q] = 3 * (q // side) * STRIDE + q % side
     total = np.empty(5 * STRIDE, np.float32)
-    for first in range(0, edge.shape[1], LENGTH):
-        last = min(first + LENGTH, edge.shape[1])
+    first = 0
+    last = 0
+    while last < edge.shape[1]:
+        first = last
+        is_turned = first >= turned
+        last = min(first + LENGTH, edge.shape[1] if is_turned else min(turned, edge.shape[1]))
+        for q in range(side * side):
+            row = q % side if is_turned else q // side
+            column = q // side if is_turned else q % side
+            starts[q] = 3 * row * STRIDE + column
         for f in range(n_frequencies):
             for row in range(side):
                 _gather(

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from scipy import special
 
 from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.common.normals import FAST, bits_float, float_bits
 
 f4 = np.float32
+ZERO = f4(0)
+ONE = f4(1)
+TWELVE = f4(12)
 SMALLEST = 1e-12
 NEVER_ZERO = f4(SMALLEST)
 NOISY_AMPLITUDE = 0.1  # relative noise from which the mean amplitude is computed by Rice's formula
@@ -43,9 +48,7 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
     """Return the light of an exposure. Each sample has its own variance, plus step^2/12 by the
     converter's rounding."""
     phases = exposure.means.shape[1]
-    angle = 2 * np.pi * np.arange(phases)[:, None] / phases
-    cosines = np.cos(angle).astype(f4)
-    sines = np.sin(angle).astype(f4)
+    angle = 2 * np.pi * np.arange(phases) / phases
     shape = (len(gains), exposure.sigma.size)
     light = Light(
         phasor=np.empty(shape, np.complex64),
@@ -55,21 +58,15 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
         relative_noise=np.empty(shape, f4),
     )
     for f, means in enumerate(exposure.means):
-        variance = exposure.sigma**2 + _converter_step(means, knee) ** 2 / 12
-        # direction and length of the phasor; without light there is no direction: any will do
-        re = (means * cosines).sum(axis=0)
-        im = (means * sines).sum(axis=0)
-        length = np.maximum(np.sqrt(re * re + im * im), NEVER_ZERO)
-        re = np.where(length > NEVER_ZERO, re / length, f4(1))
-        im = np.where(length > NEVER_ZERO, im / length, f4(0))
-        light.phasor[f].real = re
-        light.phasor[f].imag = im
-        light.amplitude[f] = gains[f] * f4(2 / phases) * length
-        # deviations across and along that direction
-        across = (variance * (re * sines - im * cosines) ** 2).sum(axis=0)
-        along = (variance * (re * cosines + im * sines) ** 2).sum(axis=0)
-        light.phase_noise[f] = np.sqrt(across) / length
-        light.relative_noise[f] = np.sqrt(along) / length
+        _write_light(
+            means,
+            exposure.sigma,
+            f4(knee),
+            np.cos(angle).astype(f4),
+            np.sin(angle).astype(f4),
+            f4(gains[f] * f4(2 / phases)),
+            Light._make(part[f] for part in light),
+        )
     light.mean_amplitude[:] = light.amplitude * np.sqrt(f4(1) + light.phase_noise**2)
     noisy = light.relative_noise > NOISY_AMPLITUDE
     light.mean_amplitude[noisy] = _mean_by_rice(
@@ -78,11 +75,82 @@ def light_of_samples(exposure: AmcwExposure, knee: float, gains: np.ndarray) -> 
     return light
 
 
-def _converter_step(samples: np.ndarray, knee: float) -> np.ndarray:
-    """Return the companding converter's step at each sample: the power of two at or below the
-    sample over the knee, at least 1."""
-    octave = (np.abs(samples / f4(knee)).view(np.uint32) & EXPONENT_BITS).view(f4)
-    return np.maximum(octave, f4(1))
+@numba.njit(**FAST)
+def _write_light(  # type: ignore[no-untyped-def]
+    means,
+    sigma,
+    knee,
+    cosines,
+    sines,
+    scale,
+    light,
+):
+    """Write one frequency's ``light``, but its mean amplitude.
+    `scenes.sensor.amcw.light_reference` has the same in NumPy.
+
+    Args:
+        means, sigma: (k, n) and (n,), as in `exposure.AmcwExposure`.
+        knee: largest sample of unit steps, halved.
+        cosines, sines: (k,) of the phase steps.
+        scale: amplitude in converter units over the length of the sum of samples.
+        light: of this frequency, (n,) each; written.
+    """
+    n = sigma.size
+    re = np.zeros(n, f4)
+    im = np.zeros(n, f4)
+    for k in range(len(means)):
+        _add_scaled(cosines[k], means[k], re)
+        _add_scaled(sines[k], means[k], im)
+    # direction and length of the phasor; without light there is no direction: any will do
+    length = np.empty(n, f4)
+    for i in range(np.uint64(n)):
+        size = max(np.sqrt(re[i] * re[i] + im[i] * im[i]), NEVER_ZERO)
+        lit = size > NEVER_ZERO
+        re[i] = re[i] / size if lit else ONE
+        im[i] = im[i] / size if lit else ZERO
+        length[i] = size
+    # variances across and along that direction
+    across = np.zeros(n, f4)
+    along = np.zeros(n, f4)
+    for k in range(len(means)):
+        _add_variances(means[k], sigma, knee, re, im, cosines[k], sines[k], across, along)
+    for i in range(n):
+        light.phasor[i] = complex(re[i], im[i])
+        light.amplitude[i] = scale * length[i]
+        light.phase_noise[i] = np.sqrt(across[i]) / length[i]
+        light.relative_noise[i] = np.sqrt(along[i]) / length[i]
+
+
+@numba.njit(**FAST)
+def _add_scaled(scale, values, total):  # type: ignore[no-untyped-def]
+    """Add ``scale`` times the values (n,) to their ``total`` (n,)."""
+    for i in range(np.uint64(total.size)):
+        total[i] += values[i] * scale
+
+
+@numba.njit(**FAST)
+def _add_variances(  # type: ignore[no-untyped-def]
+    samples,
+    sigma,
+    knee,
+    re,
+    im,
+    cosine,
+    sine,
+    across,
+    along,
+):
+    """Add the variances (n,) that the noise of one phase step's ``samples`` (n,) has ``across`` and
+    ``along`` phasors of direction (``re``, ``im``)."""
+    for i in range(np.uint64(samples.size)):
+        # the converter's step is the power of two at or below the sample over the knee, at least 1
+        word: Any = float_bits(abs(samples[i]) / knee)
+        step = max(bits_float(word & EXPONENT_BITS), ONE)
+        variance = sigma[i] * sigma[i] + step * step / TWELVE
+        sideways = re[i] * sine - im[i] * cosine
+        forward = re[i] * cosine + im[i] * sine
+        across[i] += variance * (sideways * sideways)
+        along[i] += variance * (forward * forward)
 
 
 def _mean_by_rice(

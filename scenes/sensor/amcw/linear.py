@@ -35,6 +35,8 @@ from scenes.sensor.common.normals import FAST
 
 # a limit so far away counts as never met: 3e-6 a frame for pixels just that far off
 DEVIATIONS = 4.5
+# most variance not of first order: it is then right to 1 %; beyond, frames are simulated
+MOST_HIGHER = 0.025
 # phase noise in radians above which a pixel's phase is not a normal about its mean
 LARGEST_NORMAL = 0.35
 # limit of the phase noise in radians, which would be too large for float32 where there is no light
@@ -116,7 +118,8 @@ def linearised(
     filtered: Filtered,
 ) -> Moves:
     """Fill ``filtered`` at some pixels of a view, and return how each neighbour's noise moves
-    them.
+    them. A pixel at which noise of one frequency is not of first order stays unknown at the
+    frequencies that follow, as its frames are simulated whatever they are.
 
     Args:
         pixels: (m,) flat indices.
@@ -127,11 +130,13 @@ def linearised(
     """
     shape_of_moves = (len(light.phase_noise), len(pixels), window.space.size)
     moves = Moves(np.zeros(shape_of_moves, f4), np.zeros(shape_of_moves, f4))
+    chosen = np.arange(len(pixels))
     for f in range(len(light.phase_noise)):
         light_of_frequency = Light._make(part[f] for part in light)
         filtered_of_frequency = Filtered._make(part[f] for part in filtered)
         _linearise(
             pixels,
+            chosen,
             light_of_frequency,
             window,
             shape,
@@ -139,6 +144,7 @@ def linearised(
             moves.phase[f],
             moves.amplitude[f],
         )
+        chosen = chosen[filtered.higher_share[f, pixels[chosen]] <= MOST_HIGHER]
     return moves
 
 
@@ -178,6 +184,7 @@ END = ROW * 16
 @numba.njit(**FAST)
 def _linearise(  # type: ignore[no-untyped-def]
     pixels,
+    chosen,
     light,
     window,
     shape,
@@ -185,7 +192,8 @@ def _linearise(  # type: ignore[no-untyped-def]
     moves,
     amplitude_moves,
 ):
-    """Do the work of `linearised` for one frequency; arrays have no first axis."""
+    """Do the work of `linearised` for one frequency and the ``chosen`` (c,) indices of pixels;
+    arrays have no first axis."""
     k = window.space.size
     middle = k // 2
     by_amplitude = window.by_amplitude
@@ -194,11 +202,12 @@ def _linearise(  # type: ignore[no-untyped-def]
     centre = np.uint64(middle) * VALUES
     neighbours = np.array([np.uint64(q) * VALUES for q in range(k) if q != middle], np.uint64)
     batch = np.empty(ABREAST, np.int64)
-    for start in range(0, pixels.size, ABREAST):
+    for start in range(0, chosen.size, ABREAST):
         # the last batch may have fewer pixels: it repeats the last one
         for x in range(ABREAST):
-            batch[x] = pixels[min(start + x, pixels.size - 1)]
-        written = batch[: min(ABREAST, pixels.size - start)]
+            batch[x] = pixels[chosen[min(start + x, chosen.size - 1)]]
+        rows = chosen[start : start + ABREAST]
+        written = batch[: rows.size]
         _gather(
             batch,
             light,
@@ -225,7 +234,8 @@ def _linearise(  # type: ignore[no-untyped-def]
             values,
             sums,
             filtered,
-            amplitude_moves[start : start + ABREAST],
+            rows,
+            amplitude_moves,
         )
         if sums[FITS : FITS + ROW].max() > ZERO:
             _write_mean_phasors(
@@ -238,7 +248,6 @@ def _linearise(  # type: ignore[no-untyped-def]
                 sums,
                 filtered,
             )
-            moves_of_batch = moves[start : start + ABREAST]
             _write_phase_noise(
                 written,
                 by_amplitude,
@@ -247,7 +256,8 @@ def _linearise(  # type: ignore[no-untyped-def]
                 values,
                 sums,
                 filtered,
-                moves_of_batch,
+                rows,
+                moves,
             )
 
 
@@ -412,10 +422,11 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
     values,
     sums,
     filtered,
+    rows,
     moves,
 ):
-    """Write the filtered amplitude, its deviation and its ``moves`` (`ABREAST` or fewer, k), and
-    the filtered phasor if noise leaves the phases unchanged."""
+    """Write the filtered amplitude, its deviation and, into these ``rows`` of ``moves`` (m, k), its
+    moves, and the filtered phasor if noise leaves the phases unchanged."""
     weights = SUMS[0]
     amplitudes = SUMS[1]
     variance = SUMS[2]
@@ -490,7 +501,7 @@ def _write_amplitudes(  # type: ignore[no-untyped-def]
         values[centre + FIRST + x] = size if by_length + of_centre > ZERO else -size
         for q in range(neighbours.size + 1):
             move = values[np.uint64(q) * VALUES + FIRST + np.uint64(x)]
-            moves[x, q] = move / sums[weights + x]
+            moves[rows[x], q] = move / sums[weights + x]
 
 
 # ---------------------------------------------------------------- complex numbers in rows
@@ -658,10 +669,11 @@ def _write_phase_noise(  # type: ignore[no-untyped-def]
     values,
     sums,
     filtered,
+    rows,
     moves,
 ):
     """Write the phase's deviation, the share of its variance that is not of first order in phases,
-    and its ``moves`` (`ABREAST` or fewer, k) by each neighbour's noise."""
+    and, into these ``rows`` of ``moves`` (m, k), its moves by each neighbour's noise."""
     inverse = SUMS[0]  # complex: 1 / S without noise
     total = SUMS[2]  # complex: S without noise
     by_neighbours = SUMS[4]  # sum of moves
@@ -720,7 +732,7 @@ def _write_phase_noise(  # type: ignore[no-untyped-def]
         by_centre2 = (1.0 - sums[by_neighbours + x]) ** 2 * centre2 + higher
         values[centre + MOVE + x] = np.sqrt(by_centre2)
         for q in range(neighbours.size + 1):
-            moves[x, q] = values[np.uint64(q) * VALUES + MOVE + np.uint64(x)]
+            moves[rows[x], q] = values[np.uint64(q) * VALUES + MOVE + np.uint64(x)]
         total_variance = sums[variance + x] + by_centre2
         filtered.phase_noise[i] = np.sqrt(total_variance)
         filtered.higher_share[i] = higher / max(total_variance, SMALLEST)

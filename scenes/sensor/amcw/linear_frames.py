@@ -47,7 +47,7 @@ class Linear(NamedTuple):
     by_centre: np.ndarray
     """(n,) float32: that by its own noise, beyond its weight's part."""
     uneven: np.ndarray
-    """(m,): flat indices of the uneven pixels."""
+    """(m,): flat indices of the uneven pixels, ascending."""
     moves: np.ndarray
     """(m, side^2) float32: change of an uneven pixel's z by each neighbour's noise."""
     amplitude_moves: np.ndarray
@@ -90,48 +90,46 @@ def draw_linear_frame(  # type: ignore[no-untyped-def]
     side = linear.taps.size
     half = side // 2
     width = w + 2 * half
-    padded = np.zeros((h + 2 * half, width), f4)
-    values = padded.reshape(padded.size)
-    image = padded[half : half + h, half : half + w]
-    sums = np.empty((h, w), f4)
-    flat_sums = sums.reshape(sums.size)
-    starts = linear.uneven // w * width + linear.uneven % w
-
-    # the amplitude of all pixels as if they were even, then that of the others
-    image[:] = normals[1].reshape(shape)
-    unit_taps = linear.taps / np.sqrt((linear.taps * linear.taps).sum())
-    _sum_windows(padded, unit_taps, sums)
-    amplitude[:] = linear.amplitude
-    _add_products(linear.amplitude_noise, flat_sums, amplitude)
-    for m in range(starts.size):
-        i = linear.uneven[m]
-        change = _window_sum(values, starts[m], width, side, linear.amplitude_moves[m])
-        amplitude[i] = linear.amplitude[i] + change
-
-    # z, to which an uneven pixel's ``by_neighbour`` and ``by_centre`` of 0 add nothing
-    noise = linear.noise * normals[0]
-    image[:] = noise.reshape(shape)
-    _sum_windows(padded, linear.taps, sums)
-    z_m[:] = linear.z
-    _add_scaled(error, linear.by_path, z_m)
-    _add_products(linear.by_neighbour, flat_sums, z_m)
-    _add_products(linear.by_centre, noise, z_m)
-    for m in range(starts.size):
-        z_m[linear.uneven[m]] += _window_sum(values, starts[m], width, side, linear.moves[m])
-    _round(linear.base, step_m, z_m)
-
-
-@numba.njit(**FAST)
-def _sum_windows(padded, taps, sums):  # type: ignore[no-untyped-def]
-    """Write the ``sums`` (h, w) of windows of values (h + 2 half, w + 2 half), weighted by taps
-    (2 half + 1,) along rows and columns."""
-    h = len(sums)
-    width = padded.shape[1]
-    values = padded.reshape(padded.size)
-    down = np.empty(width, f4)
+    # pictures with a border of zeros, flat
+    noise = np.zeros((h + 2 * half) * width, f4)
+    length_noise = np.zeros(noise.size, f4)
     for y in range(h):
-        _sum_over(values, y * width, width, taps, down)
-        _sum_over(down, 0, 1, taps, sums[y])
+        row = slice(y * w, (y + 1) * w)
+        start = (y + half) * width + half
+        _multiply(linear.noise[row], normals[0, row], noise[start : start + w])
+        length_noise[start : start + w] = normals[1, row]
+
+    # row by row, so that what is read again is still in the processor's innermost cache
+    unit_taps = linear.taps / np.sqrt((linear.taps * linear.taps).sum())
+    down = np.empty(width, f4)
+    sums = np.empty(w, f4)
+    m = 0
+    for y in range(h):
+        row = slice(y * w, (y + 1) * w)
+        centre = (y + half) * width + half
+        # the amplitude of all pixels as if they were even, then that of the others
+        _sum_over(length_noise, y * width, width, unit_taps, down)
+        _sum_over(down, 0, 1, unit_taps, sums)
+        _move_amplitude(linear.amplitude[row], linear.amplitude_noise[row], sums, amplitude[row])
+        # z, to which an uneven pixel's ``by_neighbour`` and ``by_centre`` of 0 add nothing
+        _sum_over(noise, y * width, width, linear.taps, down)
+        _sum_over(down, 0, 1, linear.taps, sums)
+        _displace(linear.z[row], linear.by_path[row], error, z_m[row])
+        _move_z(
+            linear.by_neighbour[row],
+            sums,
+            linear.by_centre[row],
+            noise[centre : centre + w],
+            z_m[row],
+        )
+        while m < linear.uneven.size and linear.uneven[m] < (y + 1) * w:
+            i = linear.uneven[m]
+            start = y * width + i - y * w
+            change = _window_sum(length_noise, start, width, side, linear.amplitude_moves[m])
+            amplitude[i] = linear.amplitude[i] + change
+            z_m[i] += _window_sum(noise, start, width, side, linear.moves[m])
+            m += 1
+        _round(linear.base[row], step_m, z_m[row])
 
 
 @numba.njit(**FAST)
@@ -171,17 +169,31 @@ def _window_sum(values, start, width, side, factors):  # type: ignore[no-untyped
 
 
 @numba.njit(**FAST)
-def _add_scaled(scale, values, total):  # type: ignore[no-untyped-def]
-    """Add ``scale`` times the values (n,) to their ``total`` (n,)."""
-    for x in range(np.uint64(total.size)):
-        total[x] += scale * values[x]
+def _multiply(factors, values, products):  # type: ignore[no-untyped-def]
+    """Write the ``products`` of factors and values, (n,) each."""
+    for x in range(np.uint64(products.size)):
+        products[x] = factors[x] * values[x]
 
 
 @numba.njit(**FAST)
-def _add_products(factors, values, total):  # type: ignore[no-untyped-def]
-    """Add the products of ``factors`` and values (n,) to their ``total`` (n,)."""
-    for x in range(np.uint64(total.size)):
-        total[x] += factors[x] * values[x]
+def _move_amplitude(mean, deviation, change, amplitude):  # type: ignore[no-untyped-def]
+    """Write the ``amplitude`` of n pixels, (n,) each: its mean and so many deviations."""
+    for x in range(np.uint64(amplitude.size)):
+        amplitude[x] = mean[x] + deviation[x] * change[x]
+
+
+@numba.njit(**FAST)
+def _displace(mean, by_path, error, z):  # type: ignore[no-untyped-def]
+    """Write z (n,) without noise of a frame that is displaced by ``error`` steps."""
+    for x in range(np.uint64(z.size)):
+        z[x] = mean[x] + error * by_path[x]
+
+
+@numba.njit(**FAST)
+def _move_z(by_neighbour, sums, by_centre, noise, z):  # type: ignore[no-untyped-def]
+    """Add to z what noise changes, by the ``sums`` of windows and the pixels' own, (n,) each."""
+    for x in range(np.uint64(z.size)):
+        z[x] = z[x] + by_neighbour[x] * sums[x] + by_centre[x] * noise[x]
 
 
 @numba.njit(**FAST)

@@ -1,7 +1,7 @@
 """Pixels that go through the whole chain alone: which light they need, and their frames.
 
-The windows of runs of such pixels in a row stand side by side as strips, so that one loop filters
-them all."""
+The windows of runs of such pixels in a row, or in a column, stand side by side as strips, so that
+one loop filters them all."""
 
 from __future__ import annotations
 
@@ -32,8 +32,12 @@ class Listed(NamedTuple):
     filter takes saturated pixels like those beyond the picture."""
     strips: np.ndarray
     """(side, s) int32: indices in ``exposure`` of the columns of windows, run by run."""
+    turned: int
+    """First column of the windows that are turned: their columns are rows of the picture."""
     columns: np.ndarray
     """(m,): first column of the window of each pixel that gets a range."""
+    middles: np.ndarray
+    """(m,): index of each in ``exposure``."""
     wanted: np.ndarray
     """(p,): indices of ``pixels`` among those that get a range."""
     neighbours: np.ndarray
@@ -54,20 +58,22 @@ def listed_of(wanted: np.ndarray, imager: AmcwImager, exposure: AmcwExposure) ->
     halo_pixels = np.flatnonzero(halo)
     number_in_range = _running_numbers(ranges, -1)
     number_in_halo = _running_numbers(halo, len(halo_pixels))
-    strips, columns = _strips(ranges, number_in_halo, side, len(halo_pixels))
+    strips, turned, columns = _strips(ranges, number_in_halo, side, len(halo_pixels))
     of_exposure = np.append(halo_pixels, 0)
     return Listed(
         pixels=np.flatnonzero(wanted),
         halo=halo_pixels,
         exposure=AmcwExposure(
-            means=np.ascontiguousarray(exposure.means[..., of_exposure]),
+            means=exposure.means.take(of_exposure, axis=-1),
             sigma=exposure.sigma[of_exposure],
             limit=np.append(exposure.limit[halo_pixels], f4(-1)),
             time_share=exposure.time_share[of_exposure],
             shape=(1, len(of_exposure)),
         ),
         strips=strips,
+        turned=turned,
         columns=columns,
+        middles=strips[side // 2, columns + side // 2],
         wanted=number_in_range[wanted],
         neighbours=windows_of(number_in_range, 3, -1, range_pixels),
         engine=engine._replace(
@@ -83,11 +89,39 @@ def _running_numbers(pixels: np.ndarray, without: int) -> np.ndarray:
     return np.where(pixels, numbers, without).astype(np.int32)
 
 
+def _run_lengths(pixels: np.ndarray) -> np.ndarray:
+    """Return (h, w): the length of the run of pixels (h, w) bool in a row to which each belongs, 0
+    elsewhere."""
+    changes = np.diff(np.pad(pixels, ((0, 0), (1, 1))).view(np.int8).ravel())
+    lengths = np.flatnonzero(changes == -1) - np.flatnonzero(changes == 1)
+    of_pixels = np.zeros(pixels.shape, int)
+    of_pixels[pixels] = np.repeat(lengths, lengths)
+    return of_pixels
+
+
 def _strips(
     pixels: np.ndarray, numbers: np.ndarray, side: int, beyond: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ``strips`` and ``columns`` of `Listed` for pixels (h, w) bool, with the
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Return ``strips``, ``turned`` and ``columns`` of `Listed` for pixels (h, w) bool, with the
     ``numbers`` (h, w) of all pixels, and ``beyond`` outside the picture."""
+    # a run of m pixels takes m + side - 1 columns: each pixel goes with the longer of its two runs
+    in_rows = pixels & (_run_lengths(pixels) >= _run_lengths(pixels.T).T)
+    in_columns = np.ascontiguousarray((pixels & ~in_rows).T)
+    turned_numbers = np.ascontiguousarray(numbers.T)
+    upright_strips, upright_columns = _strips_of_rows(in_rows, numbers, side, beyond)
+    turned_strips, turned_columns = _strips_of_rows(in_columns, turned_numbers, side, beyond)
+    turned = upright_strips.shape[1]
+    columns = np.empty(pixels.shape, int)
+    columns[in_rows] = upright_columns
+    columns.T[in_columns] = turned + turned_columns
+    return np.concatenate([upright_strips, turned_strips], axis=1), turned, columns[pixels]
+
+
+def _strips_of_rows(
+    pixels: np.ndarray, numbers: np.ndarray, side: int, beyond: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the strips of runs in rows, and each pixel's first column; arguments as of
+    `_strips`."""
     half = side // 2
     padded = np.pad(pixels, half)
     padded_numbers = np.pad(numbers, half, constant_values=beyond)
@@ -107,7 +141,6 @@ def decoded(
     (p,)."""
     strips = listed.strips
     side = len(strips)
-    middles = strips[side // 2, listed.columns + side // 2]
     n_frequencies = len(reading.amplitude)
     windows = strips.shape[1] - side + 1
     filtered = np.empty((n_frequencies, 3, windows), f4)
@@ -116,6 +149,7 @@ def decoded(
         reading.unit,
         reading.amplitude,
         strips,
+        listed.turned,
         imager.filter_settings,
         filtered,
         edge,
@@ -124,7 +158,7 @@ def decoded(
     frame = imager.decode(
         filtered=filtered.take(listed.columns, axis=-1),
         edge=edge.take(listed.columns, axis=-1),
-        saturated=reading.saturated[middles],
+        saturated=reading.saturated[listed.middles],
         engine=listed.engine,
         neighbours=listed.neighbours,
         error_m=error_m,

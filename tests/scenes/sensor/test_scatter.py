@@ -56,6 +56,30 @@ def test_narrow_and_wide_blurs_meet():
     assert just_below == pytest.approx(samples / samples.sum(), abs=0.002)
 
 
+def test_light_of_all_paths_spreads_as_direct_light_does():
+    """Before a step in closed form, which sends direct light only."""
+    means = {}
+    for multipath, blur_px in ((False, 1.0), (True, 1.0), (True, 0.0)):
+        config = CameraConfig(
+            effects=NO_EFFECTS.model_copy(update={"multipath": multipath}),
+            numbers={"scatter.blur_px": blur_px},
+        )
+        camera = camera_of(config)
+        region = Region(280, 300, 300, 330)
+        middle = np.median(camera.nominal_lens.region_slopes(region)[..., 0])
+        view = layered_view(
+            camera,
+            region,
+            Plane(0.6),
+            Plane(0.7),
+            lambda slopes, middle=middle: slopes[..., 0] < middle,
+            0.6,
+        )
+        means[multipath, blur_px] = SimulatedUnit(camera, config, view).exposure.means
+    assert np.array_equal(means[False, 1.0], means[True, 1.0])
+    assert not np.array_equal(means[True, 1.0], means[True, 0.0])
+
+
 def test_stray_light_draws_a_near_patch_towards_its_surroundings():
     """A tenth of the light from far and wide: the phasor of what is 1.5 times as near and small
     keeps nine tenths."""

@@ -25,6 +25,7 @@ from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.sensor import source
 from scenes.sensor.amcw import first_order, kernels
 from scenes.sensor.amcw.facts import AmcwCamera, ExposuresFacts
+from scenes.sensor.amcw.first_order import joined_moves, share_noise
 from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
 from scenes.sensor.amcw.light import light_of_samples
 from scenes.sensor.amcw.listed import decoded
@@ -536,9 +537,51 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     )
     part = decoded(listed, imager, of_list, 0.002)
     assert len(listed.pixels) > 100
+    # windows of runs in rows, and turned ones of runs in columns
+    assert listed.columns.min() < listed.turned <= listed.columns.max()
     for values, of_picture in zip(part, whole, strict=True):
         wanted = of_picture.ravel()[listed.pixels]
         assert np.array_equal(values, wanted, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", FILTERING)
+def test_linear_pixels_share_the_noise_of_the_lists_readings(name: str):
+    """A pixel's phases turned back, each by its share, and its sum of amplitudes, in NumPy; both
+    are normals over many readings."""
+    unit = unit_before_hole(name, 200.0)
+    imager = unit.model
+    model = unit.first_order
+    assert model is not None
+    assert isinstance(imager, AmcwImager)
+    halo = model.listed.halo
+    noise = model.halo_noise
+    rng = random_stream(6)
+    shared = np.full((2, unit.exposure.sigma.size), np.nan, np.float32)
+    drawn = []
+    for _ in range(200):
+        reading = imager.reading(model.listed.exposure, rng)
+        share_noise(reading.unit, reading.amplitude, noise, halo, shared)
+        drawn.append(shared[:, halo].copy())
+    assert np.isnan(np.delete(shared, halo, axis=1)).all()
+    phasor = (reading.unit[0] + 1j * reading.unit[1]) * reading.amplitude
+    across = (phasor[:, : len(halo)] * noise.turn_back).imag.sum(axis=0)
+    longer = reading.amplitude[:, : len(halo)].sum(axis=0) - noise.mean_amplitude
+    np.testing.assert_allclose(shared[0, halo], across, rtol=1e-3, atol=2e-4)
+    np.testing.assert_allclose(shared[1, halo], longer / noise.amplitude_noise, atol=2e-4)
+    lit = noise.mean_amplitude > 20 * noise.amplitude_noise
+    normals = np.array(drawn)[:, :, lit]
+    assert np.abs(normals.mean(axis=(0, 2))).max() < 0.01
+    np.testing.assert_allclose(normals.std(axis=(0, 2)), 1.0, atol=0.01)
+
+
+def test_moves_of_independent_frequencies_add_as_squares_with_the_sign_of_the_sum():
+    rng = np.random.default_rng(1)
+    moves = rng.standard_normal((3, 40, 25)).astype(np.float32)
+    scales = np.array([0.5, 1.0, 2.0], np.float32)
+    chosen = np.array([0, 7, 39])
+    pulls = scales[:, None, None] * moves[:, chosen]
+    expected = np.sign(pulls.sum(axis=0)) * np.sqrt((pulls**2).sum(axis=0))
+    np.testing.assert_allclose(joined_moves(moves, chosen, scales), expected, rtol=1e-6)
 
 
 def test_pixels_that_may_saturate_are_listed():
