@@ -48,8 +48,8 @@ def _options(parser: argparse.ArgumentParser) -> None:
     "simulated camera. Write audit.html, audit.csv and audit.parquet.",
     "tofpod audit --quick",
     "tofpod audit --quick --no-boards --out audit",
-    epilog="A simulated study takes 0.2 s of processor time, one with a precision 1.2 s: all 14 "
-    "cases some 40 minutes, --quick 4, and the boards besides.",
+    epilog="A simulated study takes 0.2 s of processor time, one with a precision 0.7 s: all 14 "
+    "cases some 25 minutes, --quick 3, and the boards besides.",
 )
 def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""

@@ -15,6 +15,7 @@ from harness.__main__ import main
 from harness.programs.artefacts.declaration import data_file, declared_artefacts
 from harness.programs.artefacts.ledger import edited_files, read_ledger
 from harness.programs.artefacts.quoted import documents, quotation, quoted_in, read_rows
+from harness.programs.audit.rows import AUDIT
 from harness.programs.dataset.score_rank import leaderboard
 from harness.programs.filters.tables import FILTER_COSTS
 from harness.programs.scorecard.figures import SCORES
@@ -124,7 +125,7 @@ def test_ls_lists_every_artefact_with_what_has_changed(capsys: pytest.CaptureFix
 
 def test_the_columns_that_tables_quote_are_written():
     """So that a renamed column is noticed before an artefact has been computed for an hour."""
-    declared = (*STUDY_TABLES, *SUMMARISED, SCORES, FILTER_COSTS, leaderboard())
+    declared = (*STUDY_TABLES, *SUMMARISED, SCORES, FILTER_COSTS, AUDIT, leaderboard())
     tables = {table.name: table for table in declared}
     for name, artefact in declared_artefacts().items():
         if artefact.table is None:
