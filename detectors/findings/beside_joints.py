@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from detectors.findings.joints import DEEPEST, Joints, plane_along
+from detectors.findings.joints import DEEPEST, Joints, plane_along, rim_of
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
 from harness.vocabulary.geometry import Cloud
@@ -44,7 +44,7 @@ def damage_beside(
 ) -> tuple[TouchingDamage, ...]:
     """Return the damage that the differing joints of a feature touch."""
     points_m = cloud.points_m.reshape(-1, 3)
-    plane, half_m = _outline(cloud, detections, measurements, feature)
+    plane, half_m = _outline(cloud, evidence, detections, measurements, feature)
     touching = []
     for number in feature.differing:
         joint = detections[number]
@@ -77,7 +77,7 @@ def fragments_of(
     joint: its ends, where the rim or another joint parts them from it."""
     points_m = cloud.points_m.reshape(-1, 3)
     residual_m = evidence.residual_m.reshape(-1)
-    plane, half_m = _outline(cloud, detections, measurements, feature)
+    plane, half_m = _outline(cloud, evidence, detections, measurements, feature)
     places_m = [points_m[detection.pixels] @ plane for detection in detections]
     low_m = np.array([place_m.min(axis=0) for place_m in places_m])
     high_m = np.array([place_m.max(axis=0) for place_m in places_m])
@@ -104,17 +104,21 @@ def _deepest_m(residuals_m: np.ndarray) -> float:
 
 def _outline(
     cloud: Cloud,
+    evidence: Evidence,
     detections: Sequence[Detection],
     measurements: Sequence[Measurement],
     feature: Joints,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions (3, 2) along and across the joints of a feature, and half the extent
-    (2,) of the largest outline of those that are alike, metres."""
+    (2,) of the largest outline of those that are alike, metres: of whole ones, if the rim does not
+    cut all, as pixels at the rim may lengthen what it cuts."""
     points_m = cloud.points_m.reshape(-1, 3)
     strongest = feature.members[0]
     plane = plane_along(measurements[strongest].along, detections[strongest].centre_m)
+    rim = rim_of(evidence).ravel()
+    whole = [number for number in feature.members if not rim[detections[number].pixels].any()]
     half_m = np.zeros(2)
-    for number in feature.members:
+    for number in whole or feature.members:
         places_m = points_m[detections[number].pixels] @ plane
         middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
         half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))

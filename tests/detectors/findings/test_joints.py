@@ -71,7 +71,7 @@ def test_head_joints_are_one_feature() -> None:
     assert len(facts["places_px"]) == len(BRICKS)
 
 
-@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points"])
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "length_m", "points"])
 def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     detections, measurements = wall()
     usual = getattr(measurements[7], field)
