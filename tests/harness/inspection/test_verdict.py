@@ -11,6 +11,7 @@ import pytest
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from harness.inspection import verdict
 from harness.inspection.verdict import (
+    _plan_areas_m2,
     counted_text,
     extent_of,
     flags_of,
@@ -270,6 +271,15 @@ def test_the_area_of_a_cloud_without_a_grid_is_that_of_its_plan_view() -> None:
     evidence = Evidence(flat, flat, points[..., 2], 1e-3)
     extent = extent_of(Judged(cloud, evidence, (), ()), None)
     assert extent.judged_m2 == pytest.approx(0.08, rel=0.05)
+
+
+def test_the_area_in_plan_by_hand() -> None:
+    """Twelve points fill four squares of 3 mm2; eleven are too few to tell."""
+    y_m, x_m = np.mgrid[:3, :4] * 1e-3
+    points_m = np.stack([x_m, y_m, np.ones((3, 4))], axis=-1)
+    assert _plan_areas_m2(points_m) == pytest.approx(np.full((3, 4), 1e-6))
+    points_m[0, 0] = np.nan
+    assert np.isnan(_plan_areas_m2(points_m)).all()
 
 
 # ---- the sentence
