@@ -3,7 +3,7 @@ due."""
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,9 @@ from detectors.findings.missing import measure_missing, missing_returns, one_dam
 from detectors.findings.null import RIM_PX, OwnThreshold, own_threshold
 from detectors.findings.objects import each_object_once
 from detectors.findings.odds import noise_probabilities
+from detectors.findings.steps import explained_by_steps
 from detectors.interface import Detection, Detector, Evidence, Measurement, MissingReturns
+from detectors.methods.local import LocalEvidence
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
 from harness.inspection.verdict import FalseCalls, calls_text, with_remarks
@@ -51,13 +53,15 @@ finding."""
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage above a threshold and missing returns, each damage, each object and each set of
-    joints once, measure them, and say how certain each is."""
+    joints once, without what a profile's steps explain, measure them, and say how certain each
+    is."""
     missing = missing_returns(cloud, evidence)
     if missing is not None and cloud.expected is not None:
         missing = _without_features(cloud, missing)
     without_return = () if missing is None else missing.detections
     above_threshold = detector.find(cloud, evidence, threshold)
-    objects_once = each_object_once(cloud, evidence, above_threshold)
+    evidence, unexplained = _without_steps(cloud, evidence, above_threshold)
+    objects_once = each_object_once(cloud, evidence, unexplained)
     detections = one_damage_once(cloud.valid.shape, objects_once, without_return)
     measurements = tuple(
         _measured(detector, cloud, evidence, detection) for detection in detections
@@ -80,6 +84,23 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)
+
+
+def _without_steps(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]
+) -> tuple[Evidence, tuple[Detection, ...]]:
+    """Leave out what the uncertain steps of a profile explain, and note how much that is."""
+    # a reference has an error everywhere, which the tolerances count
+    if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
+        return evidence, tuple(detections)
+    explained = explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
+    if not explained:
+        return evidence, tuple(detections)
+    notes = {**evidence.notes, "at_steps": len(explained)}
+    left = tuple(
+        detection for number, detection in enumerate(detections) if number not in explained
+    )
+    return replace(evidence, notes=notes), left
 
 
 def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:

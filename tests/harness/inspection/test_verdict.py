@@ -331,6 +331,22 @@ def test_the_sentence_says_which_share_of_the_part_was_judged() -> None:
 
 
 @pytest.mark.parametrize(
+    ("count", "clause"),
+    [
+        (0, "; 1.0 false calls"),
+        (1, "; one place departs no more than the profile is uncertain at its steps; 1.0"),
+        (14, "; 14 places depart no more than the profile is uncertain at its steps; 1.0"),
+    ],
+)
+def test_the_sentence_says_how_many_places_steps_explain(count: int, clause: str) -> None:
+    judged = judged_of(20.0)
+    notes = {"own_null": NULL, "at_steps": count}
+    judged = replace(judged, evidence=replace(judged.evidence, notes=notes))
+    sentence = verdict_of(with_remarks(judged, 5.0), 5.0).sentence
+    assert sentence.startswith(f"One hole found on 96 cm2 of the part{clause}")
+
+
+@pytest.mark.parametrize(
     ("differing", "clause"),
     [
         (0, "6 joints of 76 x 9 mm in rows, all alike;"),
