@@ -23,8 +23,9 @@ SIGMAS = 3.0  # of the profile's own deviation that it explains
 def explained_by_steps(
     spread_m: np.ndarray, residual_m: np.ndarray, detections: Sequence[Detection]
 ) -> tuple[int, ...]:
-    """Return the numbers of the findings by depth that lie mostly at or beside uncertain pixels of
-    a profile, and on these depart by no more than `SIGMAS` of its own deviation on average.
+    """Return the numbers of the findings by depth, but joints, that lie mostly at or beside
+    uncertain pixels of a profile, and on these depart by no more than `SIGMAS` of its own deviation
+    on average.
 
     Args:
         spread_m: (h, w), standard deviation of the surface itself; 0 or NaN where it is certain.
@@ -36,7 +37,7 @@ def explained_by_steps(
     is_beside = grown(own_m.reshape(spread_m.shape) > 0, 1).ravel()
     explained = []
     for number, detection in enumerate(detections):
-        if detection.kind != "depth":
+        if detection.kind != "depth" or detection.count > 1:
             continue
         residuals_m = residual_m.ravel()[detection.pixels]
         departing_m = residuals_m * np.sign(residuals_m.sum())

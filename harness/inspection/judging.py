@@ -60,8 +60,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         missing = _without_features(cloud, missing)
     without_return = () if missing is None else missing.detections
     above_threshold = detector.find(cloud, evidence, threshold)
-    evidence, unexplained = _without_steps(cloud, evidence, above_threshold)
-    objects_once = each_object_once(cloud, evidence, unexplained)
+    objects_once = each_object_once(cloud, evidence, above_threshold)
     detections = one_damage_once(cloud.valid.shape, objects_once, without_return)
     measurements = tuple(
         _measured(detector, cloud, evidence, detection) for detection in detections
@@ -81,26 +80,23 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints, fragments)
+    explained = _at_steps(cloud, evidence, detections)
+    if explained:
+        evidence = replace(evidence, notes={**evidence.notes, "at_steps": len(explained)})
+        left = [number for number in range(len(detections)) if number not in explained]
+        detections = tuple(detections[number] for number in left)
+        measurements = tuple(measurements[number] for number in left)
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)
 
 
-def _without_steps(
-    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]
-) -> tuple[Evidence, tuple[Detection, ...]]:
-    """Leave out what the uncertain steps of a profile explain, and note how much that is."""
+def _at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
+    """Return the numbers of the findings that the uncertain steps of a profile explain."""
     # a reference has an error everywhere, which the tolerances count
     if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
-        return evidence, tuple(detections)
-    explained = explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
-    if not explained:
-        return evidence, tuple(detections)
-    notes = {**evidence.notes, "at_steps": len(explained)}
-    left = tuple(
-        detection for number, detection in enumerate(detections) if number not in explained
-    )
-    return replace(evidence, notes=notes), left
+        return ()
+    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
 
 
 def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:

@@ -1,5 +1,7 @@
 """Findings at the steps of a profile, by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,7 +44,8 @@ def test_damage_beside_a_step_or_across_it_is_not_explained() -> None:
     across = found(slice(5, 15), slice(GROOVE - 4, GROOVE + 5))  # 3 of 9 columns lie beside it
     at_step = found(slice(20, 30), slice(GROOVE - 1, GROOVE + 4))  # 3 of 5
     gone = found(slice(20, 30), slice(GROOVE, GROOVE + 1), kind="no return")
-    findings = [beside, across, at_step, gone]
+    joints = replace(at_step, count=5)
+    findings = [beside, across, at_step, gone, joints]
     assert explained_by_steps(spread(), residual_m, findings) == (2,)
 
 
