@@ -174,6 +174,11 @@ def test_volume_and_deviation_are_those_of_a_dent(tmp_path: Path) -> None:
     # 25 pixels of 0.3 mm each, the largest of some 260 places
     sizes = {entry.name.split(",")[0]: entry.size for entry in deviation.contributions}
     assert sizes["noise"] == pytest.approx(0.3 / 5 * 3.55 / GUARD, rel=0.15)
+    # the drawing is placed with an error that differs little over the dent
+    from_middle_m = np.linalg.norm(points_m - result.detections[0].centre_m, axis=1)
+    assert cloud.expected is not None
+    placed_mm = 1e3 * cloud.expected.registration_at(points_m[from_middle_m < 8e-3])
+    assert sizes["registration"] == pytest.approx(np.nanmean(placed_mm), rel=0.2)
     without_dent = casting_seen(path, stood((6, -8, 3)), 0.3)
     undamaged = replace(without_dent, expected=cloud.expected)
     result = judged(detector, undamaged, detector.analyse(undamaged), 6.0)
