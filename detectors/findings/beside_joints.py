@@ -135,17 +135,32 @@ def without_damage(feature: Joints, touching: Sequence[TouchingDamage]) -> Joint
 
 
 def _middle(places_m: np.ndarray, half_m: np.ndarray) -> np.ndarray:
-    """Return the middle (2,) of a joint among places (n, 2) that damage widens: along each axis,
-    that of the extent of a joint that holds the most places. ``half_m`` (2,): half that extent."""
-    middle_m = np.zeros(2)
-    for axis in (0, 1):
-        ordered_m = np.sort(places_m[:, axis])
-        ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m[axis], side="right")
-        counts = ends - np.arange(len(ordered_m))
-        first = int(counts.argmax())
-        last = int(ends[first]) - 1
-        middle_m[axis] = 0.5 * (ordered_m[first] + ordered_m[last])
-    return middle_m
+    """Return the middle (2,) of a joint among places (n, 2) that damage lengthens or widens.
+    ``half_m`` (2,): half the joint's extent."""
+    along_m, across_m = places_m.T
+    return np.array([_middle_along(along_m, half_m[0]), _middle_across(across_m, half_m[1])])
+
+
+def _middle_along(places_m: np.ndarray, half_m: float) -> float:
+    """Return the middle of a joint along it. What is longer ends with damage on one side, where it
+    is wider than a joint: the joint is the part from the other end, which holds fewer places."""
+    low_m = float(places_m.min())
+    high_m = float(places_m.max())
+    if high_m - low_m <= 2.0 * half_m:
+        return 0.5 * (low_m + high_m)
+    from_low = (places_m <= low_m + 2.0 * half_m).sum()
+    from_high = (places_m >= high_m - 2.0 * half_m).sum()
+    return low_m + half_m if from_low < from_high else high_m - half_m
+
+
+def _middle_across(places_m: np.ndarray, half_m: float) -> float:
+    """Return the middle of a joint across it: that of the extent that holds the most places."""
+    ordered_m = np.sort(places_m)
+    ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m, side="right")
+    counts = ends - np.arange(len(ordered_m))
+    first = int(counts.argmax())
+    last = int(ends[first]) - 1
+    return 0.5 * float(ordered_m[first] + ordered_m[last])
 
 
 def _without_joint(evidence: Evidence, joint: Detection, damage: Detection) -> Evidence:
