@@ -22,8 +22,9 @@ def kabsch(
     signs = np.ones(spread.shape[:-1])
     signs[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     T = np.zeros((*spread.shape[:-2], 4, 4))
-    T[..., :3, :3] = np.swapaxes(vt, -1, -2) @ (signs[..., None] * np.swapaxes(u, -1, -2))
-    T[..., :3, 3] = to_centre - np.einsum("...ij,...j->...i", T[..., :3, :3], from_centre)
+    R = np.swapaxes(vt, -1, -2) @ (signs[..., None] * np.swapaxes(u, -1, -2))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = to_centre - np.einsum("...ij,...j->...i", R, from_centre)
     T[..., 3, 3] = 1.0
     return T
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from harness.vocabulary.geometry import Region
+from harness.vocabulary.geometry import Region, rays_of
 from scenes.optics import NoiseFreeView, Optics, footprint_of, wave_numbers
 from scenes.sensor.common.facts import CameraFacts
 
@@ -74,7 +74,7 @@ def image_view(
     slopes = camera.nominal_lens.region_slopes(region)
     z_m = z_m.reshape(-1, *region.shape)
     light = light.reshape(-1, *region.shape)
-    points = np.concatenate([slopes, np.ones((*region.shape, 1))], axis=-1) * z_m[..., None]
+    points = rays_of(slopes) * z_m[..., None]
     range_m = np.linalg.norm(points, axis=-1)
     path_m = np.nan_to_num(range_m + np.linalg.norm(optics.emitter_m - points, axis=-1))
     amplitude = np.where(np.isfinite(z_m), np.nan_to_num(light), 0.0)
@@ -186,7 +186,7 @@ def _lit(
     optics: Optics,
 ) -> _RayEnds:
     """Return the ends on a plane of rays (..., 2) from the lens."""
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
+    rays = rays_of(slopes)
     points = rays * plane.z_along_m(slopes)[..., None]
     to_emitter = optics.emitter_m - points
     leg_out = np.linalg.norm(to_emitter, axis=-1)

@@ -20,7 +20,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, transform_points
+from harness.vocabulary.geometry import MM, Frame, Lens, Reason, Region, rays_of, transform_points
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import AnyCamera, camera_of, number_paths, numbers_of_lens
@@ -197,7 +197,7 @@ def implant_of(
         return Implant(region, shift_m, noise_m, lost)
     # the recording is aligned to other pixels: interpolate between the camera's pixels
     onto = reached.region(lens)
-    rays = np.concatenate([lens.region_slopes(onto), np.ones((*onto.shape, 1))], axis=-1)
+    rays = rays_of(lens.region_slopes(onto))
     pixels = camera.nominal_lens.project(rays)
     rows_columns = [pixels[..., 1] - region.row0, pixels[..., 0] - region.col0]
 
@@ -263,7 +263,7 @@ class _ReachedDisc:
 
     def holds(self, slopes: np.ndarray) -> np.ndarray:
         """Return (h, w) bool: which rays with these slopes (h, w, 2) meet it."""
-        rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+        rays = rays_of(slopes)
         normal = self.axes[:, 2]
         depth_m = (self.centre_m @ normal) / (rays @ normal)
         on_plane = rays * depth_m[..., None]

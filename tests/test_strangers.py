@@ -91,6 +91,12 @@ def test_three_doubtful_false_findings_are_right_and_four_are_not(board):
     assert scored(*board, 0, "", [*true, *stray[:3]]).verdict == "right"
     four = scored(*board, 0, "", [*true, *stray])
     assert four.verdict == "wrong" and four.why == ("4 doubtful ones false",)
+    assert (four.doubtful, math.isnan(four.expected)) == (4, True)
+    # an answer that states an interval is held to it
+    said = "No damage is sure; 1.0 false calls expected (0 to {})."
+    stated = scored(*board, 0, said.format(4), [*true, *stray])
+    assert (stated.verdict, stated.doubtful, stated.expected) == ("right", 4, 1.0)
+    assert scored(*board, 0, said.format(3), [*true, *stray]).verdict == "wrong"
     sure = [{**row, "certainty": "sure"} for row in stray[:2]]
     assert scored(*board, 0, "", [*true, *sure]).why == ("2 false",)
 

@@ -11,7 +11,7 @@ from detectors.averages.average import AverageConfig, prefix_averages
 from detectors.filters import DepthFilterConfig, load_filter
 from detectors.filters.interface import DepthFilter, DepthFunction
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, Lens, Reason, Region
+from harness.vocabulary.geometry import MM, Cloud, Frame, FrameSource, Lens, Reason, Region, rays_of
 
 USUAL_UNIT_M = 1 * MM
 """Step of the stored depth where it is unknown, which most drivers use."""
@@ -96,7 +96,7 @@ def filtered_average(cloud: Cloud, slopes: np.ndarray, depth_filter: DepthFilter
     before_m = cloud.points_m[..., 2]
     function = depth_filter.started(cloud.z_step_m or USUAL_UNIT_M, whole=False)
     z_m = _through(function, before_m, depth_filter.name).astype(float)
-    rays = np.concatenate([slopes, np.ones((*z_m.shape, 1))], axis=-1)
+    rays = rays_of(slopes)
     return replace(
         cloud,
         points_m=rays * z_m[..., None],

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from detectors.findings.joints import DEEPEST, Joints, plane_along
+from detectors.findings.joints import DEEPEST, Joints, plane_along, rim_of
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown
 from harness.vocabulary.geometry import Cloud
@@ -44,7 +44,7 @@ def damage_beside(
 ) -> tuple[TouchingDamage, ...]:
     """Return the damage that the differing joints of a feature touch."""
     points_m = cloud.points_m.reshape(-1, 3)
-    plane, half_m = _outline(cloud, detections, measurements, feature)
+    plane, half_m = _outline(cloud, evidence, detections, measurements, feature)
     touching = []
     for number in feature.differing:
         joint = detections[number]
@@ -77,7 +77,7 @@ def fragments_of(
     joint: its ends, where the rim or another joint parts them from it."""
     points_m = cloud.points_m.reshape(-1, 3)
     residual_m = evidence.residual_m.reshape(-1)
-    plane, half_m = _outline(cloud, detections, measurements, feature)
+    plane, half_m = _outline(cloud, evidence, detections, measurements, feature)
     places_m = [points_m[detection.pixels] @ plane for detection in detections]
     low_m = np.array([place_m.min(axis=0) for place_m in places_m])
     high_m = np.array([place_m.max(axis=0) for place_m in places_m])
@@ -104,17 +104,21 @@ def _deepest_m(residuals_m: np.ndarray) -> float:
 
 def _outline(
     cloud: Cloud,
+    evidence: Evidence,
     detections: Sequence[Detection],
     measurements: Sequence[Measurement],
     feature: Joints,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions (3, 2) along and across the joints of a feature, and half the extent
-    (2,) of the largest outline of those that are alike, metres."""
+    (2,) of the largest outline of those that are alike, metres: of whole ones, if the rim does not
+    cut all, as pixels at the rim may lengthen what it cuts."""
     points_m = cloud.points_m.reshape(-1, 3)
     strongest = feature.members[0]
     plane = plane_along(measurements[strongest].along, detections[strongest].centre_m)
+    rim = rim_of(evidence).ravel()
+    whole = [number for number in feature.members if not rim[detections[number].pixels].any()]
     half_m = np.zeros(2)
-    for number in feature.members:
+    for number in whole or feature.members:
         places_m = points_m[detections[number].pixels] @ plane
         middle_m = 0.5 * (places_m.min(axis=0) + places_m.max(axis=0))
         half_m = np.maximum(half_m, np.abs(places_m - middle_m).max(axis=0))
@@ -131,17 +135,32 @@ def without_damage(feature: Joints, touching: Sequence[TouchingDamage]) -> Joint
 
 
 def _middle(places_m: np.ndarray, half_m: np.ndarray) -> np.ndarray:
-    """Return the middle (2,) of a joint among places (n, 2) that damage widens: along each axis,
-    that of the extent of a joint that holds the most places. ``half_m`` (2,): half that extent."""
-    middle_m = np.zeros(2)
-    for axis in (0, 1):
-        ordered_m = np.sort(places_m[:, axis])
-        ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m[axis], side="right")
-        counts = ends - np.arange(len(ordered_m))
-        first = int(counts.argmax())
-        last = int(ends[first]) - 1
-        middle_m[axis] = 0.5 * (ordered_m[first] + ordered_m[last])
-    return middle_m
+    """Return the middle (2,) of a joint among places (n, 2) that damage lengthens or widens.
+    ``half_m`` (2,): half the joint's extent."""
+    along_m, across_m = places_m.T
+    return np.array([_middle_along(along_m, half_m[0]), _middle_across(across_m, half_m[1])])
+
+
+def _middle_along(places_m: np.ndarray, half_m: float) -> float:
+    """Return the middle of a joint along it. What is longer ends with damage on one side, where it
+    is wider than a joint: the joint is the part from the other end, which holds fewer places."""
+    low_m = float(places_m.min())
+    high_m = float(places_m.max())
+    if high_m - low_m <= 2.0 * half_m:
+        return 0.5 * (low_m + high_m)
+    from_low = (places_m <= low_m + 2.0 * half_m).sum()
+    from_high = (places_m >= high_m - 2.0 * half_m).sum()
+    return low_m + half_m if from_low < from_high else high_m - half_m
+
+
+def _middle_across(places_m: np.ndarray, half_m: float) -> float:
+    """Return the middle of a joint across it: that of the extent that holds the most places."""
+    ordered_m = np.sort(places_m)
+    ends = np.searchsorted(ordered_m, ordered_m + 2.0 * half_m, side="right")
+    counts = ends - np.arange(len(ordered_m))
+    first = int(counts.argmax())
+    last = int(ends[first]) - 1
+    return 0.5 * float(ordered_m[first] + ordered_m[last])
 
 
 def _without_joint(evidence: Evidence, joint: Detection, damage: Detection) -> Evidence:

@@ -49,7 +49,8 @@ class Joints:
     members: tuple[int, ...]
     """Numbers of the detections that are alike, strongest first."""
     differing: tuple[int, ...]
-    """Numbers of those in the same rows that depart in width, depth, area or deepest place."""
+    """Numbers of those in the same rows that depart in width, depth, area, length or deepest
+    place."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ def _slots(
 ) -> _Slots:
     """Return the findings by depth whose sizes are known, strongest first, that are long or
     reach the rim."""
-    rim = _rim(evidence).ravel()
+    rim = rim_of(evidence).ravel()
     numbers = []
     long = []
     cut = []
@@ -214,7 +215,7 @@ def _centre(measured: Measurement) -> np.ndarray:
     return measured.extent_centre_m
 
 
-def _rim(evidence: Evidence) -> np.ndarray:
+def rim_of(evidence: Evidence) -> np.ndarray:
     """Return (h, w) bool: the pixels beside those that are not judged or not in the picture."""
     outside = np.pad(~np.isfinite(evidence.residual_m), 1, constant_values=True)
     return grown(outside, 1)[1:-1, 1:-1]
@@ -250,7 +251,7 @@ def _similar(slots: _Slots, seed: int) -> np.ndarray:
 
 
 def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
-    """Return which slots (n,) depart from the members (n,) in width, depth, area or deepest
+    """Return which slots (n,) depart from the members (n,) in width, depth, area, length or deepest
     place by more than these scatter and than what is less certain about them, as about a slot that
     the rim cuts. An end has no width."""
     result = np.zeros(len(slots.numbers), bool)
@@ -266,6 +267,10 @@ def _departing(slots: _Slots, members: np.ndarray) -> np.ndarray:
     scatter_m2 = _scatter(slots.areas_m2, usual_m2, certain)
     result |= slots.areas_m2 > usual_m2 + SCATTERS * scatter_m2
     result |= _exceeds(slots, slots.deepest_m, certain)
+    # at the end of a joint, where it is no wider, it shows in the length
+    whole = certain & ~slots.cut
+    if whole.any():
+        result |= ~slots.cut & slots.is_long & _exceeds(slots, slots.lengths_m, whole)
     # less of it leaves an error that no slot explains; alone, that is a fit that was not determined
     is_larger = slots.areas_m2 > usual_m2 + scatter_m2
     result |= ~slots.cut & is_larger & _exceeds(slots, width_errors_m, certain)
@@ -350,7 +355,8 @@ def _on_lattice(
 
     judged = np.isfinite(evidence.residual_m)
     pixel_of = _pixel_map(cloud.points_m[judged] @ plane, judged)
-    area_m2 = float(judged.sum()) / max(abs(float(np.linalg.det(pixel_of[:2]))), 1e-12)
+    pixels_per_m2 = abs(float(np.linalg.det(pixel_of[:2])))
+    area_m2 = float(judged.sum()) / max(pixels_per_m2, 1e-12)
     chance = min(float(4.0 * reach_m[similar].prod(axis=1).sum()) / area_m2, 1.0)
     pairs = _pairs(similar)
     moves: list[np.ndarray] = []

@@ -169,6 +169,40 @@ class Surroundings:
         )
 
 
+@dataclass(frozen=True)
+class _Grid:
+    """The pixels around a detection (h, w), or means over squares of them."""
+
+    residual_m: np.ndarray
+    """(h, w): z minus the surface; NaN where it is not judged."""
+    detected: np.ndarray
+    """(h, w) bool: the detection's pixels."""
+    invalid: np.ndarray
+    """(h, w) bool: pixels without a range."""
+    per_px_m: np.ndarray
+    """(2, 3): the surface's derivatives by u and v."""
+    u0: float
+    """Centroid of the detection's pixels, along columns."""
+    v0: float
+    """The same along rows."""
+    blur_px: tuple[float, float]
+    """Sides of the camera's blur along u and v."""
+
+    def means(self, side: int) -> _Grid:
+        """Return the means over squares of ``side`` pixels."""
+        coverage = _means(self.detected.astype(float), side)
+        blur_u, blur_v = self.blur_px
+        return _Grid(
+            residual_m=_means(self.residual_m, side),
+            detected=coverage >= min(0.5, coverage.max()),
+            invalid=_means(self.invalid.astype(float), side) > 0.5,
+            per_px_m=side * self.per_px_m,
+            u0=(self.u0 + 0.5) / side - 0.5,
+            v0=(self.v0 + 0.5) / side - 0.5,
+            blur_px=(_binned_blur(blur_u, side), _binned_blur(blur_v, side)),
+        )
+
+
 def surroundings_of(
     cloud: Cloud,
     evidence: Evidence,
@@ -180,54 +214,16 @@ def surroundings_of(
     """Cut out the detection with a margin of twice the blur or `MARGIN_SHARE` of its size on each
     side, in means over squares of pixels where these are small; None with too few valid pixels
     around. ``fine``: all pixels instead."""
-    h, w = cloud.points_m.shape[:2]
-    rows, columns = np.unravel_index(detection.pixels, (h, w))
-    middle = (float(rows.mean()), float(columns.mean()))
-    blur_px = blur_in_cells(cloud, config, middle)
-    tight = Region(
-        int(rows.min()),
-        int(rows.max()) + 1,
-        int(columns.min()),
-        int(columns.max()) + 1,
-    )
-    widest = max(tight.row1 - tight.row0, tight.col1 - tight.col0)
-    margin_px = math.ceil(max(2 * max(blur_px) + 2, MARGIN_SHARE * widest))
-    corner = tight.grown(margin_px, h, w)
-    cut = corner.within(Region(0, h, 0, w))
-    residual_m = evidence.residual_m[cut]
-    points_m = cloud.points_m[cut]
-    detected = np.zeros(residual_m.shape, dtype=bool)
-    detected[rows - corner.row0, columns - corner.col0] = True
-    plane = local_plane(
-        points_m,
-        evidence.surface_z_m[cut],
-        np.isfinite(residual_m),
-        detected,
-        cloud.projection,
-    )
-    if plane is None:
+    cut_out = _cut_out(cloud, evidence, detection, config)
+    if cut_out is None:
         return None
-    origin_m, per_px_m = plane
-    u0, v0 = _centroid(detected)
-    binned = 1
-    if not fine:
-        # several pixels across the detection: a slot is long, but narrow
-        across_px = len(rows) / widest
-        binned = min(max(residual_m.shape) // MOST_SIDE_PX, int(across_px / FEWEST_ACROSS))
-        if cloud.noise_reach_px:  # its blurs are many fits
-            binned = max(binned, int(min(blur_px) / FINE_BLUR_PX))
-        binned = max(binned, 1)
-    invalid = ~np.isfinite(points_m[..., 2])
+    grid, origin_m = cut_out
+    binned = 1 if fine else _square_side(cloud, grid)
     if binned > 1:
-        residual_m = _means(residual_m, binned)
-        coverage = _means(detected.astype(float), binned)
-        detected = coverage >= min(0.5, coverage.max())
-        invalid = _means(invalid.astype(float), binned) > 0.5
-        per_px_m = binned * per_px_m
-        u0 = (u0 + 0.5) / binned - 0.5
-        v0 = (v0 + 0.5) / binned - 0.5
-        blur_u, blur_v = blur_px
-        blur_px = (_binned_blur(blur_u, binned), _binned_blur(blur_v, binned))
+        grid = grid.means(binned)
+    residual_m = grid.residual_m
+    detected = grid.detected
+    blur_px = grid.blur_px
     finite = np.isfinite(residual_m)
     reach_px = int(max(blur_px) / 2)
     widened = grown(detected, reach_px + 1)
@@ -247,34 +243,92 @@ def surroundings_of(
     patch = HolePatch(
         residual_m=residual_m,
         used=used,
-        metric_m2=per_px_m @ per_px_m.T,
+        metric_m2=grid.per_px_m @ grid.per_px_m.T,
         blur_px=blur_px,
         lens_px=_lens_sides(cloud, config, blur_px),
         brightness=1.0 if config.by_light else 0.0,
         half_m=math.inf if cloud.noise_reach_px else config.linear_depth_mm * MM,
         noise_m=noise_m,
-        sights=_sights(cloud, origin_m, per_px_m, config),
+        sights=_sights(cloud, origin_m, grid.per_px_m, config),
         shared_px=blur_px,
     )
-    normal_share, sight_share = _shares_of_residual(cloud, evidence, origin_m, per_px_m)
+    normal_share, sight_share = _shares_of_residual(cloud, evidence, origin_m, grid.per_px_m)
     return Surroundings(
         patch=patch,
         detected=detected,
         widened=widened,
         binned=binned,
-        invalid=invalid,
+        invalid=grid.invalid,
         offset_m=offset_m,
         sign=sign,
         peak_m=max(quantile_of(sign * deviations_m, 0.9), 1e-9),
         reach_px=reach_px,
         normal_share=normal_share,
         sight_share=sight_share,
-        u0=u0,
-        v0=v0,
+        u0=grid.u0,
+        v0=grid.v0,
         origin_m=origin_m,
-        per_px_m=per_px_m,
+        per_px_m=grid.per_px_m,
         blurs=_blurs_of(cloud),
     )
+
+
+def _cut_out(
+    cloud: Cloud, evidence: Evidence, detection: Detection, config: HoleModelConfig
+) -> tuple[_Grid, np.ndarray] | None:
+    """Return the pixels around a detection, and the surface's point (3,) at its centroid; None
+    without a plane through them."""
+    h, w = cloud.points_m.shape[:2]
+    rows, columns = np.unravel_index(detection.pixels, (h, w))
+    middle = (float(rows.mean()), float(columns.mean()))
+    blur_px = blur_in_cells(cloud, config, middle)
+    tight = Region(
+        int(rows.min()),
+        int(rows.max()) + 1,
+        int(columns.min()),
+        int(columns.max()) + 1,
+    )
+    widest = max(tight.shape)
+    margin_px = math.ceil(max(2 * max(blur_px) + 2, MARGIN_SHARE * widest))
+    corner = tight.grown(margin_px, h, w)
+    cut = corner.within(Region(0, h, 0, w))
+    residual_m = evidence.residual_m[cut]
+    points_m = cloud.points_m[cut]
+    detected = np.zeros(residual_m.shape, dtype=bool)
+    detected[rows - corner.row0, columns - corner.col0] = True
+    plane = local_plane(
+        points_m,
+        evidence.surface_z_m[cut],
+        np.isfinite(residual_m),
+        detected,
+        cloud.projection,
+    )
+    if plane is None:
+        return None
+    origin_m, per_px_m = plane
+    u0, v0 = _centroid(detected)
+    grid = _Grid(
+        residual_m=residual_m,
+        detected=detected,
+        invalid=~np.isfinite(points_m[..., 2]),
+        per_px_m=per_px_m,
+        u0=u0,
+        v0=v0,
+        blur_px=blur_px,
+    )
+    return grid, origin_m
+
+
+def _square_side(cloud: Cloud, grid: _Grid) -> int:
+    """Return the side of the squares of pixels whose means are fitted, 1 for each pixel alone."""
+    rows, columns = np.nonzero(grid.detected)
+    widest = int(max(np.ptp(rows), np.ptp(columns))) + 1
+    # several pixels across the detection: a slot is long, but narrow
+    across_px = len(rows) / widest
+    side = min(max(grid.detected.shape) // MOST_SIDE_PX, int(across_px / FEWEST_ACROSS))
+    if cloud.noise_reach_px:  # its blurs are many fits
+        side = max(side, int(min(grid.blur_px) / FINE_BLUR_PX))
+    return max(side, 1)
 
 
 def _other_damage(deviations_m: np.ndarray, noise_m: float, detected: np.ndarray) -> np.ndarray:

@@ -396,8 +396,11 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
         rows = rows - rows.min()
         columns = columns - columns.min()
         # the last channel counts points
-        image = np.zeros((int(rows.max()) + 1, int(columns.max()) + 1, features.shape[1] + 1))
-        np.add.at(image, (rows, columns), np.column_stack([features, np.ones(len(features))]))
+        counted = np.column_stack([features, np.ones(len(features))])
+        height = int(rows.max()) + 1
+        width = int(columns.max()) + 1
+        image = np.zeros((height, width, counted.shape[1]))
+        np.add.at(image, (rows, columns), counted)
         side = (settings.pool_px, settings.pool_px)
         pooled = cv2.blur(image, side, borderType=cv2.BORDER_CONSTANT)[rows, columns]
         return pooled[:, :-1] / pooled[:, -1:], rows, columns

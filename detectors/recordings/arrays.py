@@ -589,7 +589,9 @@ def _map_frames(
     z_m[~is_finite] = np.nan
     rows, columns = heights.shape
     v, u = np.mgrid[:rows, :columns]
-    xy_m = np.stack([u - (columns - 1) / 2, v - (rows - 1) / 2], axis=-1) * pitch_m
+    x_px = u - (columns - 1) / 2
+    y_px = v - (rows - 1) / 2
+    xy_m = np.stack([x_px, y_px], axis=-1) * pitch_m
     xy_m[~is_finite] = np.nan
     reason = np.where(is_finite, Reason.VALID, Reason.NO_RETURN).astype(np.uint8)
     yield Frame(name, z_m.astype(np.float32), reason, xy_m=xy_m)

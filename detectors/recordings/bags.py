@@ -427,7 +427,8 @@ def lens_of_info(message: Any, shape: tuple[int, ...], is_rectified: bool = Fals
     if is_rectified or not d.any():
         d = np.zeros(0)
     model = str(message.distortion_model)
-    is_known = model.lower() in KNOWN_MODELS and d.size in (4, 5, 8, 12, 14) and not d[8:].any()
+    is_counted = d.size in (4, 5, 8, 12, 14) and not d[8:].any()
+    is_known = model.lower() in KNOWN_MODELS and is_counted
     if d.size and not is_known:
         model = model or "(none)"
         return f"has the distortion model {model} with {d.size} numbers, which is not supported"

@@ -37,7 +37,7 @@ from harness.vocabulary.files import (
     refuse_pixels,
     strict_json,
 )
-from harness.vocabulary.geometry import Frame, Lens, transform_points
+from harness.vocabulary.geometry import Frame, Lens, rays_of, transform_points
 
 TITLES = ("DEPTH", "IR", "COLOR")
 LEGAL_MKV = "a recording of k4arecorder with its DEPTH track"
@@ -133,7 +133,7 @@ def colour_on_depth(
     """Return the colour (h, w, 3) uint8 at each depth pixel, bilinear; black where depth or colour
     is missing. Not modelled: occlusion between the two cameras (32 mm apart in an Azure Kinect).
     """
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     points_colour = transform_points(colour.T_colour_depth, rays * z_m[..., None])
     lens = colour.lens
     is_visible = np.isfinite(points_colour).all(axis=-1) & (points_colour[..., 2] > 0)
@@ -141,9 +141,11 @@ def colour_on_depth(
     colour_px[is_visible] = lens.project(points_colour[is_visible])
     # Beyond the frame the rational distortion may fold back into it; true rays there are steeper
     # than the corner's.
-    corner = np.abs(lens.slopes(np.array([0, lens.width - 1]), np.array([0, lens.height - 1])))
+    last_column = lens.width - 1
+    last_row = lens.height - 1
+    corners = np.abs(lens.slopes(np.array([0, last_column]), np.array([0, last_row])))
     depths = np.where(is_visible, points_colour[..., 2], 1.0)[..., None]
-    is_steep = np.abs(points_colour[..., :2] / depths) > 1.2 * corner.max(0)
+    is_steep = np.abs(points_colour[..., :2] / depths) > 1.2 * corners.max(axis=0)
     colour_px[is_steep.any(axis=-1)] = -1e3
     return cv2.remap(
         picture,

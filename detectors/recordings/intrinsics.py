@@ -92,8 +92,9 @@ def colour_camera(
     T_colour_depth = np.eye(4)
     problem = f"{name}: the colour camera's place cannot be read"
     with read_errors(problem, "Rt with Rotation and Translation", OWN_LENS):
-        T_colour_depth[:3, :3] = np.reshape(np.array(camera["Rt"]["Rotation"], float), (3, 3))
-        T_colour_depth[:3, 3] = np.reshape(np.array(camera["Rt"]["Translation"], float), 3)
+        place = camera["Rt"]
+        T_colour_depth[:3, :3] = np.array(place["Rotation"], float).reshape(3, 3)
+        T_colour_depth[:3, 3] = np.array(place["Translation"], float).reshape(3)
     mode = ((width, rows), (0, (rows - height) // 2), (width, height))
     return ColourCamera(_lens(name, parameters, mode), T_colour_depth)
 
@@ -496,8 +497,9 @@ def _focal_and_centre(path: Path, data: dict[str, Any]) -> tuple[float, ...]:
     assert key is not None
     m = _numbers(path, key, data[key], 9)
     # the last row is 0 0 1: anything else there shows that it is by columns, as Open3D's
-    is_by_columns = m[6] or m[7]
-    return (m[0], m[4], m[6], m[7]) if is_by_columns else (m[0], m[4], m[2], m[5])
+    if m[6] or m[7]:
+        return (m[0], m[4], m[6], m[7])
+    return (m[0], m[4], m[2], m[5])
 
 
 def _distortion(path: Path, data: dict[str, Any]) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from detectors.recordings.distances import refuse_far_aside, refuse_implausible, rounding_step_m
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import limited_memory
-from harness.vocabulary.geometry import Frame, Lens, Reason, Region
+from harness.vocabulary.geometry import Frame, Lens, Reason, Region, rays_of
 
 ROUND_TRIP_PX = 0.1
 """If a pixel's ray does not return to it within this distance, the lens model has no direction for
@@ -187,7 +187,7 @@ def _returning_slopes(lens: Lens, region: Region) -> np.ndarray:
     slopes = lens.region_slopes(region)
     if not any(lens.distortion):
         return slopes
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
     pixels = np.stack([u, v], axis=-1)
     missed_px = np.abs(lens.project(rays) - pixels).max(axis=-1)

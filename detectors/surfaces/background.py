@@ -199,19 +199,13 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
     fitted[unseen] = np.nan
     cells = cells.refreshed(residuals, fit)
     warning, notes = _misfit(cells, fit, name)
-    notes.update(shape=name, steep_share=float(unseen.mean()))
+    steep_share = float(unseen.mean())
+    notes.update(shape=name, steep_share=steep_share)
     if reference is not None:
         notes["reference"] = reference.facts
-    text = name
     scale_m = None
     if wavelength is not None:
         scale_m = 0.5 * wavelength * cells.side_m / cells.side
-        text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
-    if unseen.mean() > 0.001:
-        steep = f"seen at more than {STEEPEST_DEG:g} degrees"
-        if reference is not None:
-            steep += " or at an edge of the reference"
-        text += f"; {100 * unseen.mean():.1f} % of the target, {steep}, is not judged"
     spread_m = np.zeros(len(points))
     if profile is not None:
         spread_m = profile.spread_at(points)
@@ -222,11 +216,27 @@ def background(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Backgro
         residual_m=on_grid(points[:, 2] - fitted, mask),
         noise_m=on_grid(np.hypot(_noise_of_points(cells), spread_m), mask),
         spread_m=on_grid(spread_m, mask),
-        description=text,
+        description=_description(name, scale_m, steep_share, has_reference=reference is not None),
         scale_m=scale_m,
         warning=warning,
         notes=notes,
     )
+
+
+def _description(
+    name: str, scale_m: float | None, steep_share: float, *, has_reference: bool
+) -> str:
+    """Return the shape's name and limits: from which width it follows damage, and which share of
+    the target is not judged."""
+    text = name
+    if scale_m is not None:
+        text += f", which absorbs shallow damage wider than {scale_m / MM:.0f} mm"
+    if steep_share > 0.001:
+        steep = f"seen at more than {STEEPEST_DEG:g} degrees"
+        if has_reference:
+            steep += " or at an edge of the reference"
+        text += f"; {100 * steep_share:.1f} % of the target, {steep}, is not judged"
+    return text
 
 
 def _of_few_points(

@@ -142,12 +142,9 @@ class KnownPose:
 
     def information_about(self, middle_m: np.ndarray) -> np.ndarray:
         """Return the inverse (6, 6) of the covariance of the same motion about another centre."""
+        # w' = w, and t' = t + w x (middle' - middle) is how the other centre moves
         moved = np.eye(6)
-        # t' = t + w x (middle' - middle)
-        arm = middle_m - self.middle_m
-        moved[3:, :3] = -np.array(
-            [[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]
-        )
+        moved[3:] = displacement_jacobian(middle_m[None], self.middle_m)[0]
         return np.linalg.inv(moved @ self.covariance @ moved.T)
 
     def offset_of(self, T_part_camera: np.ndarray, middle_m: np.ndarray) -> np.ndarray:

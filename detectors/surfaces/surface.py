@@ -71,12 +71,12 @@ class SurfaceConfig(Config):
 class Chebyshev:
     """Products T_a(u) T_b(v) of Chebyshev polynomials; (u, v) = ((x, y) - middle) / half."""
 
-    # orders (a, b) of each product (p, 2)
     powers: np.ndarray
-    # middle of the places (2,), metres
+    """Orders (a, b) of each product, (p, 2)."""
     middle_m: np.ndarray
-    # half of their extent (2,), metres
+    """Middle of the places (2,)."""
     half_m: np.ndarray
+    """Half of their extent (2,)."""
 
     @classmethod
     def over(cls, xy_m: np.ndarray, degree: int, cross_terms: bool = True) -> Chebyshev:
@@ -145,10 +145,11 @@ class Surface:
     """A fitted polynomial surface z(x, y)."""
 
     chebyshev: Chebyshev
-    # one for each product (p,), metres
+    """The products."""
     coefficients: np.ndarray
-    # how it was fitted
+    """The factor (p,) of each, metres; z is their sum."""
     note: str
+    """How it was fitted."""
 
     def evaluate(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return z in metres at x, y of one shape; NaN where they are NaN. Polynomials extrapolate

@@ -3,7 +3,7 @@ due."""
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,9 @@ from detectors.findings.missing import measure_missing, missing_returns, one_dam
 from detectors.findings.null import RIM_PX, OwnThreshold, own_threshold
 from detectors.findings.objects import each_object_once
 from detectors.findings.odds import noise_probabilities
+from detectors.findings.steps import explained_by_steps
 from detectors.interface import Detection, Detector, Evidence, Measurement, MissingReturns
+from detectors.methods.local import LocalEvidence
 from detectors.surfaces.background import misfit
 from harness.inspection import arguments as cli
 from harness.inspection.verdict import FalseCalls, calls_text, with_remarks
@@ -51,7 +53,8 @@ finding."""
 
 def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: float) -> Judged:
     """Find damage above a threshold and missing returns, each damage, each object and each set of
-    joints once, measure them, and say how certain each is."""
+    joints once, without what a profile's steps explain, measure them, and say how certain each
+    is."""
     missing = missing_returns(cloud, evidence)
     if missing is not None and cloud.expected is not None:
         missing = _without_features(cloud, missing)
@@ -77,9 +80,23 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints, fragments)
+    explained = _at_steps(cloud, evidence, detections)
+    if explained:
+        evidence = replace(evidence, notes={**evidence.notes, "at_steps": len(explained)})
+        left = [number for number in range(len(detections)) if number not in explained]
+        detections = tuple(detections[number] for number in left)
+        measurements = tuple(measurements[number] for number in left)
     probabilities = noise_probabilities(cloud, evidence, detections, missing)
     result = Judged(cloud, evidence, detections, measurements, missing, probabilities)
     return with_remarks(result, threshold)
+
+
+def _at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
+    """Return the numbers of the findings that the uncertain steps of a profile explain."""
+    # a reference has an error everywhere, which the tolerances count
+    if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
+        return ()
+    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
 
 
 def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:

@@ -404,6 +404,7 @@ def verdict_of(
     clauses = [_sure_clause(terms, extent, is_empty=not damage)]
     clauses += _other_clauses(damage, is_further=bool(terms))
     clauses += _joints_clauses(result.evidence.notes.get("joints", ()))
+    clauses += _steps_clauses(result.evidence.notes.get("at_steps", 0))
     clauses.append(_calls_clause(calls, false_sure if terms else math.nan))
     return InspectionVerdict(
         sentence="; ".join(clauses) + ".",
@@ -502,6 +503,16 @@ def _joints_clauses(joints: Sequence[dict[str, Any]]) -> list[str]:
             clause += f"{word} differs" if differing == 1 else f"{word} differ"
         clauses.append(clause)
     return clauses
+
+
+def _steps_clauses(count: int) -> list[str]:
+    """Return a clause on the places that a profile's steps explain, if there are any
+    (`detectors.findings.steps`)."""
+    if not count:
+        return []
+    word = WORDS[count] if count < len(WORDS) else str(count)
+    places = "place departs" if count == 1 else "places depart"
+    return [f"{word} {places} no more than the profile is uncertain at its steps"]
 
 
 def _calls_clause(calls: FalseCalls, false_sure: float) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import special
 
 from harness.evaluation.intervals import UPPER, Interval
+from harness.vocabulary.geometry import rays_of
 
 STEEPEST_DEG = 60.0
 RIM_SHARE = 0.15
@@ -99,7 +100,7 @@ class RangeImage:
 
 def range_image(points_m: np.ndarray, slopes: np.ndarray) -> RangeImage:
     """Return the ranges of points (h, w, 3) along rays with ``slopes`` (h, w, 2)."""
-    along = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    along = rays_of(slopes)
     stretch = np.linalg.norm(along, axis=-1)
     return RangeImage(points_m[..., 2] * stretch, along / stretch[..., None])
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness.vocabulary.geometry import Cloud, Lens, Reason, Region
+from harness.vocabulary.geometry import Cloud, Lens, Reason, Region, rays_of
 
 SHAPE = (90, 120)  # rows and columns: 126 by 168 mm at 0.7 m
 DISTANCE_M = 0.7
@@ -70,7 +70,7 @@ def _seen(
     for centre_x, centre_y, radius, depth in damage:
         z = z + depth * (np.hypot(x - centre_x, y - centre_y) < radius)
     z = z + NOISE_M * np.random.default_rng(seed).standard_normal(SHAPE)
-    points = np.concatenate([slopes, np.ones((*SHAPE, 1))], axis=-1) * z[..., None]
+    points = rays_of(slopes) * z[..., None]
     flat = np.zeros(SHAPE, dtype=np.uint8)
     return Cloud(
         points_m=points,

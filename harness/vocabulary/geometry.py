@@ -45,6 +45,11 @@ def invert(T_a_b: np.ndarray) -> np.ndarray:
     return T_b_a
 
 
+def rays_of(slopes: np.ndarray) -> np.ndarray:
+    """Return the rays (..., 3) with z = 1 that have these slopes x/z and y/z (..., 2)."""
+    return np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
+
+
 def rotation_xyz_deg(about_x: float, about_y: float, about_z: float) -> np.ndarray:
     """Return the 3x3 rotation Rz @ Ry @ Rx for angles in degrees (about x first)."""
     ax, ay, az = np.deg2rad([about_x, about_y, about_z])

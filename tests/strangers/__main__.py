@@ -4,16 +4,22 @@ wrong by kind."""
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 import zlib
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from tests.strangers.kinds import KINDS
 from tests.strangers.recording import flat_field_arguments, recorded, written
 from tests.strangers.score import Score, answered, scored
+
+LEAST_CHANCE = 1e-3
+"""Least probability of as many doubtful findings that are false, if as many are expected as the
+answers state."""
 
 
 def made(kind: str, seed: int, folder: Path) -> Score:
@@ -54,6 +60,8 @@ def main() -> int:
 def _report(arguments: argparse.Namespace, root: Path) -> int:
     print(f"{'kind':22s} right warned wrong needless  clear found false")
     total = np.zeros(7, int)
+    doubtful = 0
+    expected = 0.0
     wrong = []
     for kind in arguments.kinds or KINDS:
         counts = np.zeros(7, int)
@@ -61,11 +69,18 @@ def _report(arguments: argparse.Namespace, root: Path) -> int:
             score = made(kind, seed, root / kind / str(seed))
             verdicts = [score.verdict == verdict for verdict in ("right", "warned", "wrong")]
             counts += [*verdicts, score.needless, score.clear, score.found, score.false]
+            if not math.isnan(score.expected):
+                doubtful += score.doubtful
+                expected += score.expected
             if score.verdict == "wrong":
                 wrong.append(f"{kind} {seed}: {'; '.join(score.why)}")
         print(_row(kind, counts), flush=True)
         total += counts
     print(_row("all", total))
+    chance = float(stats.poisson.sf(doubtful - 1, expected))
+    print(f"{doubtful} doubtful findings are false, {expected:.1f} expected: chance {chance:.2g}")
+    if chance < LEAST_CHANCE:
+        wrong.append("more doubtful findings are false than the answers expect together")
     print("wrong without a word:" if wrong else "none is wrong without a word")
     for line in wrong:
         print(f"  {line}")

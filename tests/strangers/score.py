@@ -6,6 +6,7 @@ import contextlib
 import csv
 import io
 import math
+import re
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,10 @@ NEAR_MM = 12.0
 FALSE_CALLS = 1
 """False findings that a right answer may hold; none of them on another surface than the target."""
 DOUBTFUL_CALLS = 3
-"""False findings of the class "doubtful" that a right answer may hold besides: with one expected,
-more than three happen by chance in 2 % of captures."""
+"""False findings of the class "doubtful" that a right answer may hold besides, if it does not state
+an interval of false calls; else up to the interval's upper end."""
+INTERVAL = re.compile(r"([0-9.e-]+) false calls? expected \(\d+ to (\d+)\)")
+"""The number of false calls that an answer expects, and its interval."""
 CAUSES = {"at_rim", "open_behind", "depth_open"}
 """Flags that warn of a wrong size."""
 FACTOR = 1.5
@@ -43,6 +46,10 @@ class Score:
     clear: int
     found: int
     false: int
+    doubtful: int
+    """False findings of the class "doubtful"."""
+    expected: float
+    """False calls that the answer expects; NaN where it states none."""
 
     @property
     def needless(self) -> bool:
@@ -86,7 +93,7 @@ def scored(
         warnings.append(line)
     clear = [truth for truth in truths if truth.clear]
     if code == 2 and "Traceback" not in said and len(lines) <= 6:
-        return Score("warned", ("refused",), (), said, len(clear), 0, 0)
+        return Score("warned", ("refused",), (), said, len(clear), 0, 0, 0, math.nan)
     why = [] if code == 0 else [f"exit {code}"]
     matched = [_match(row, truths) for row in rows]
     result = {id(truth) for truth in matched if truth is not None}
@@ -112,7 +119,8 @@ def scored(
         why.append(f"{elsewhere} on another surface")
     if false > FALSE_CALLS:
         why.append(f"{false} false")
-    if doubtful > DOUBTFUL_CALLS:
+    stated = INTERVAL.search(said)
+    if doubtful > (int(stated.group(2)) if stated else DOUBTFUL_CALLS):
         why.append(f"{doubtful} doubtful ones false")
     misjudged, is_flagged = _misjudged(stranger, rows, matched)
     why += misjudged
@@ -133,6 +141,8 @@ def scored(
         len(clear),
         len(clear) - len(missed),
         false + elsewhere + doubtful,
+        doubtful,
+        float(stated.group(1)) if stated else math.nan,
     )
 
 

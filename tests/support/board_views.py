@@ -11,7 +11,14 @@ import numpy as np
 from detectors.views.marks.mark import Mark, MarkSet
 from detectors.views.registration.registered import Registration
 from detectors.views.view import PreparedView, View
-from harness.vocabulary.geometry import Cloud, Lens, invert, rotation_xyz_deg, transform_points
+from harness.vocabulary.geometry import (
+    Cloud,
+    Lens,
+    invert,
+    rays_of,
+    rotation_xyz_deg,
+    transform_points,
+)
 
 LENS = Lens(220, 160, 300.0, 300.0, 109.5, 79.5)
 HALF_X_M = 0.15
@@ -58,7 +65,7 @@ def board_view(
     """One view. ``smooth_m`` (4, 4): coefficients T_i(x) T_j(y) of Chebyshev polynomials, x and y
     from -1 to 1 on the board, that are added to z as an error of the whole view."""
     slopes = lens.region_slopes(lens.whole)
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     normal = T_camera_board[:3, 2]
     point = T_camera_board[:3, 3]
     points = rays * (normal @ point / (rays @ normal))[..., None]

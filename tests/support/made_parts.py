@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from harness.vocabulary.geometry import MM, Cloud, Lens, transform_points
+from harness.vocabulary.geometry import MM, Cloud, Lens, rays_of, transform_points
 
 LENS = Lens(width=150, height=120, fx=260.0, fy=260.0, cx=74.5, cy=59.5)
 HALF_M = (0.075, 0.055)
@@ -82,7 +82,7 @@ def pose(
 def depth_m(part: MadePart, T_camera_part: np.ndarray) -> np.ndarray:
     """The z image (h, w) without noise."""
     slopes = LENS.region_slopes(LENS.whole)
-    directions = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    directions = rays_of(slopes)
     T_part_camera = np.linalg.inv(T_camera_part)
     origin = T_part_camera[:3, 3]
     along = directions @ T_part_camera[:3, :3].T
@@ -103,7 +103,7 @@ def cloud_of(
     true_m = depth_m(part, T_camera_part)
     noise_m = noise_mm * MM * np.random.default_rng(seed).standard_normal(true_m.shape)
     slopes = LENS.region_slopes(LENS.whole)
-    directions = np.concatenate([slopes, np.ones((*true_m.shape, 1))], axis=-1)
+    directions = rays_of(slopes)
     cloud = Cloud(
         points_m=directions * (true_m + noise_m)[..., None],
         reason=np.zeros(true_m.shape, np.uint8),

@@ -16,6 +16,7 @@ from harness.vocabulary.geometry import (
     Cloud,
     Lens,
     invert,
+    rays_of,
     rotate_vectors,
     rotation_xyz_deg,
     transform_points,
@@ -56,9 +57,7 @@ class Plane:
         """(h, w) where rays with ``slopes`` (h, w, 2) end: on the plane, on the hole's wall or on
         its floor."""
         T_plane_view = invert(self.T_reference_plane) @ T_reference_view
-        rays = rotate_vectors(
-            T_plane_view, np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-        )
+        rays = rotate_vectors(T_plane_view, rays_of(slopes))
         start = T_plane_view[:3, 3]
         part = -start[2] / rays[..., 2]
         if self.hole is None:

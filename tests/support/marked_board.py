@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from harness.vocabulary.geometry import Lens, invert, rotation_xyz_deg, transform_points
+from harness.vocabulary.geometry import Lens, invert, rays_of, rotation_xyz_deg, transform_points
 
 LENS = Lens(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 DISTANCE_M = 0.5
@@ -93,7 +93,7 @@ def _meet(pose: np.ndarray, slopes: np.ndarray, height_m: float) -> tuple[np.nda
     board."""
     normal = pose[:3, 2]
     middle_m = pose[:3, 3]
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
+    rays = rays_of(slopes)
     z_m = (middle_m @ normal + height_m) / (rays @ normal)
     on_board_m = transform_points(invert(pose), rays * z_m[..., None])
     return z_m, on_board_m[..., :2]

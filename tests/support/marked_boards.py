@@ -14,6 +14,7 @@ from harness.vocabulary.geometry import (
     Lens,
     Region,
     invert,
+    rays_of,
     rotation_xyz_deg,
     transform_points,
 )
@@ -94,7 +95,7 @@ def marked_cloud(
     if rng is not None:
         # the mean of 5 x 5 independent values has a fifth of their deviation
         z = z + cv2.blur(rng.standard_normal(z.shape), (5, 5)) * 5.0 * sigma_m
-    points = np.concatenate([slopes, np.ones((*z.shape, 1))], axis=-1) * z[..., None]
+    points = rays_of(slopes) * z[..., None]
     return Cloud(
         points_m=points,
         reason=np.zeros(z.shape, np.uint8),
@@ -117,7 +118,7 @@ def prepared(name: str, marks: MarkSet, T_reference_view_guess: np.ndarray | Non
 
 def _board_places(T_camera_board: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """(..., 3) where rays (..., 2) meet the board, in its frame."""
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1)
+    rays = rays_of(slopes)
     normal = T_camera_board[:3, 2]
     origin = T_camera_board[:3, 3]
     points = rays * ((origin @ normal) / (rays @ normal))[..., None]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from harness.vocabulary.geometry import Cloud, Lens, Region
+from harness.vocabulary.geometry import Cloud, Lens, Region, rays_of
 
 CAMERAS = {
     "azure nfov": (640, 576, 504.6),
@@ -47,7 +47,7 @@ class Scene:
         """Depth of the plane, and the places (h, w) along its own axes (a level one first) about
         the centre."""
         normal = np.asarray(normal, float) / np.linalg.norm(normal)
-        rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
+        rays = rays_of(self.slopes)
         with np.errstate(divide="ignore"):
             z = (np.asarray(centre) @ normal) / (rays @ normal)
         z[z <= 0] = np.inf
@@ -105,7 +105,7 @@ class Scene:
         """The outside of a pipe (``inner``: the far half, a bent sheet seen from its hollow side)."""
         centre = np.asarray(centre, float)
         axis = np.asarray(axis, float) / np.linalg.norm(axis)
-        rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
+        rays = rays_of(self.slopes)
         flat = rays - (rays @ axis)[..., None] * axis
         away = centre - (centre @ axis) * axis
         qa = (flat**2).sum(-1)
@@ -121,7 +121,7 @@ class Scene:
 
     def sphere(self, number: int, centre, radius: float) -> None:
         centre = np.asarray(centre, float)
-        rays = np.concatenate([self.slopes, np.ones((*self.z.shape, 1))], axis=-1)
+        rays = rays_of(self.slopes)
         qa = (rays**2).sum(-1)
         qb = -2 * rays @ centre
         qc = centre @ centre - radius**2

@@ -26,7 +26,7 @@ from scipy import ndimage
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
-from harness.vocabulary.geometry import MM, Lens
+from harness.vocabulary.geometry import MM, Lens, rays_of
 from scenes.optics import NoiseFreeView, Optics, Quadrilaterals, RenderConfig, wave_numbers
 from scenes.render.direct import OffFace, cast
 from scenes.render.indirect import PathWork, gather_in_pixels
@@ -154,7 +154,7 @@ def compared(
 
 def in_holes(scene: Scene) -> np.ndarray:
     """(h, w): pixels whose central ray goes through a hole's mouth."""
-    rays = np.concatenate([scene.view.slopes, np.ones((*scene.view.slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(scene.view.slopes)
     normal = scene.target.T_camera_board[:3, 2]
     middle = scene.target.T_camera_board[:3, 3]
     on_plane = rays * ((middle @ normal) / (rays @ normal))[..., None]

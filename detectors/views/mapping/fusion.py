@@ -339,7 +339,8 @@ def fuse(
     )
 
     clouds = [view.cloud for view in views]
-    samples = np.round(np.where(fused.seen_by, extras[..., 0], 0.0).sum(axis=0)).astype(np.int32)
+    samples_seen = np.where(fused.seen_by, extras[..., 0], 0.0).sum(axis=0)
+    samples = np.round(samples_seen).astype(np.int32)
     means = (fused.shares[..., None] * np.nan_to_num(extras)).sum(axis=0)
     covered = np.isfinite(fused.height_m)
     shares = fused.shares.sum(axis=(1, 2)) / fused.shares.sum()

@@ -58,7 +58,9 @@ def integrate(views: Sequence[ChosenView], voxel_m: float | None) -> tuple[Cloud
     one frame's z over the views' targets, for the floor that rounding sets. Raises UserError if
     the field or the targets have no smooth surface."""
     clouds = [view.cloud for view in views]
-    pitch = float(np.median(clouds[0].points_m[views[0].inside][:, 2])) * views[0].slope_step
+    first = views[0]
+    first_z_m = clouds[0].points_m[first.inside][:, 2]
+    pitch = float(np.median(first_z_m)) * first.slope_step
     voxel = voxel_m if voxel_m is not None else pitch
     points, normals, rgb = _crossings(views, voxel)
     facing = _facing(views, points, normals, pitch)

@@ -41,7 +41,9 @@ class CellGrid:
     def places(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y (h, w) of the cells."""
         h, w = self.shape
-        x, y = np.meshgrid(self.x0 + self.step * np.arange(w), self.y0 + self.step * np.arange(h))
+        across = self.x0 + self.step * np.arange(w)
+        down = self.y0 + self.step * np.arange(h)
+        x, y = np.meshgrid(across, down)
         return x, y
 
 
@@ -212,7 +214,8 @@ class ChosenView:
         many points."""
         points = self.cloud.points_m
         with np.errstate(invalid="ignore"):
-            slopes = np.where(self.inside[..., None], points[..., :2] / points[..., 2:], np.nan)
+            slopes = points[..., :2] / points[..., 2:]
+        slopes[~self.inside] = np.nan
         if self.cloud.organised and min(self.inside.shape) > 1:
             along_rows = np.abs(np.diff(slopes[..., 0], axis=1))
             along_columns = np.abs(np.diff(slopes[..., 1], axis=0))
@@ -293,9 +296,11 @@ def place(
     points = transform_points(T_map_view, view.cloud.points_m[inside])
     rays = points - T_map_view[:3, 3]
     deviation = points[:, 2] - surface.evaluate(points[:, 0], points[:, 1])
+    # share of the ray by which its end is moved back
     part = deviation / rays[:, 2]
     moved = points - part[:, None] * rays
-    part += (moved[:, 2] - surface.evaluate(moved[:, 0], moved[:, 1])) / rays[:, 2]
+    left_m = moved[:, 2] - surface.evaluate(moved[:, 0], moved[:, 1])
+    part += left_m / rays[:, 2]
     places_m = np.full((*inside.shape, 2), np.nan)
     deviations = np.full(inside.shape, np.nan)
     places_m[inside] = (points - part[:, None] * rays)[:, :2]

@@ -6,7 +6,6 @@ A smooth polynomial fitted over the target removes uneven light. The scatter of 
 the threshold is extrapolated from its tail to a given rate of false pixels. Marks may cover a
 quarter of the target. Not modelled: hard shadows."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -99,7 +98,8 @@ def stand_out(
     logs = [-np.log(1.0 - share) for share in TAIL]
     shape = 2.0
     if 0 < middle < outer:
-        shape = float(np.clip(np.log(logs[1] / logs[0]) / np.log(outer / middle), 1.0, 2.0))
+        through_both = np.log(logs[1] / logs[0]) / np.log(outer / middle)
+        shape = float(np.clip(through_both, 1.0, 2.0))
     tail = outer * (-np.log(FALSE_RATE) / logs[1]) ** (1.0 / shape)
     return contrast, distance / max(tail, GAUSSIAN_LIMITS[p])
 
@@ -177,13 +177,17 @@ def find_blobs(
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     order = 1 + np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")[:MOST_BLOBS]
     large = [label for label in order if boxes[label, cv2.CC_STAT_AREA] >= LEAST_PIXELS]
-    windows = [_window(cloud, inside, coloured, labels, label, boxes[label]) for label in large]
-    rims = np.concatenate([np.zeros(0), *(rim for rim, _ in windows)])
+    windows = []
+    for label in large:
+        window = _window(cloud, inside, coloured, labels, label, boxes[label])
+        if window is not None:
+            windows.append(window)
+    rims = np.concatenate([np.zeros(0), *(window.share[window.rim] for window in windows)])
     is_mixed = (rims > 0.2) & (rims < 0.8)
     mixed = len(rims) > 0 and bool(np.mean(is_mixed) >= MIXED_SHARE)
     blobs = []
-    for _, settled in windows:
-        blob = settled(mixed)
+    for window in windows:
+        blob = window.blob(cloud, mixed)
         if blob is not None:
             blobs.append(blob)
     # a blob that shares pixels with a larger one is part of it
@@ -197,6 +201,88 @@ def find_blobs(
     return kept
 
 
+@dataclass(frozen=True)
+class _Window:
+    """The part of a picture around a group of pixels, (h, w)."""
+
+    cut: tuple[slice, slice]
+    """Rows and columns of the picture."""
+    target: np.ndarray
+    """(h, w) bool: the target's pixels."""
+    group: np.ndarray
+    """(h, w) bool: the group, as far as its colour goes."""
+    other_groups: np.ndarray
+    """(h, w) bool: pixels of another colour than the target's that are not the group's."""
+    rgb: np.ndarray
+    """(h, w, 3): the colours under even light."""
+    backdrop: np.ndarray
+    """(3,): the colour of the surroundings."""
+    span: np.ndarray
+    """(3,): the group's colour less that of the surroundings."""
+    share: np.ndarray
+    """(h, w): share of the way from the surroundings' colour (0) to the group's (1)."""
+    strays: float
+    """Standard deviation of that share in the surroundings."""
+
+    @property
+    def rim(self) -> np.ndarray:
+        """The pixels (h, w) bool on both sides of the group's border."""
+        return np.asarray(grown(self.group, 1) & ~_eroded(self.group) & self.target)
+
+    def blob(self, cloud: Cloud, mixed: bool) -> Blob | None:
+        """Return the blob of the group, pixels weighted by their share of its colour if rims are
+        ``mixed``; None if too few."""
+        weights = self.group.astype(float)
+        if mixed:
+            reach = grown(self.group, RIM_PX) & self.target & ~self.other_groups
+            weights = np.where(reach, np.clip(self.share, 0.0, 1.0), 0.0)
+        v, u = np.nonzero((weights > 0.5) & self.target)
+        if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
+            return None
+        rows, columns = self.cut
+        height_px, width_px = cloud.valid.shape
+        at_side = u.min() == -columns.start or u.max() == width_px - 1 - columns.start
+        at_end = v.min() == -rows.start or v.max() == height_px - 1 - rows.start
+        doubt = self._doubt_beyond_target(cloud)
+        if not doubt and (at_side or at_end):
+            doubt = "cut by the picture's edge"
+        used_v, used_u = np.nonzero((weights > 0) & self.target)
+        grid = np.stack([used_u, used_v], axis=1).astype(float)
+        covariance = self._mixed_covariance_px2(weights) if mixed else region_covariance_px2(grid)
+        target_v, target_u = np.nonzero(self.target)
+        # a count is added to each colour, so that black has a logarithm
+        contrast = np.log((self.backdrop + self.span + 1.0) / (self.backdrop + 1.0))
+        return Blob(
+            pixels=(used_v + rows.start) * width_px + used_u + columns.start,
+            weights=weights[used_v, used_u],
+            grid=grid,
+            grid_covariance=covariance,
+            surroundings=(target_v + rows.start) * width_px + target_u + columns.start,
+            contrast=contrast,
+            doubt=doubt,
+        )
+
+    def _doubt_beyond_target(self, cloud: Cloud) -> str:
+        """Return that the group may continue where the target has no points; empty if not."""
+        around = grown(self.group, 1) & ~self.group
+        off_colour = np.linalg.norm(self.rgb - self.backdrop - self.span, axis=-1)
+        has_colour = off_colour < ALIKE * np.linalg.norm(self.span)
+        beyond_target = around & has_colour & ~self.target
+        if beyond_target.sum() <= max(2.0, CUT_SHARE * around.sum()):
+            return ""
+        by_crop = (beyond_target & cloud.valid[self.cut]).sum() > beyond_target.sum() / 2
+        return "cut by the crop's edge" if by_crop else "without range in parts of it"
+
+    def _mixed_covariance_px2(self, weights: np.ndarray) -> np.ndarray:
+        """Return the covariance (2, 2) of the centroid of ``weights`` (h, w), of which those of
+        the rim err by `SHARE_SIGMA` and by the scatter of the surroundings' colours."""
+        middle = np.argwhere(self.group)[:, ::-1].mean(axis=0)
+        arm = np.argwhere(self.rim)[:, ::-1] - middle
+        area_px = max(float(weights.sum()), 1.0)
+        variance = SHARE_SIGMA**2 + self.strays**2
+        return np.asarray(variance * arm.T @ arm / area_px**2)
+
+
 def _window(
     cloud: Cloud,
     inside: np.ndarray,
@@ -204,10 +290,9 @@ def _window(
     labels: np.ndarray,
     label: int,
     box: np.ndarray,
-) -> tuple[np.ndarray, Callable[[bool], Blob | None]]:
-    """Return the shares (n,) of the way from the surroundings' colour (0) to the group's (1) on
-    both sides of its border, and a function that makes a blob of the group once it is known
-    whether rims are mixed."""
+) -> _Window | None:
+    """Return the window of a group by its number in ``labels`` (h, w) and its box; None if the
+    target's own colour is not visible around it."""
     left_px, top, width, height, area = box.tolist()
     margin = max(RING_PX + 2, round(0.5 * np.sqrt(area)))
     row = max(top - margin, 0)
@@ -216,75 +301,34 @@ def _window(
     assert cloud.rgb is not None
     target = inside[cut]
     candidates = coloured[cut]
-    group = (labels[cut] == label) & candidates
-    core = _eroded(group)
-    core = core if core.sum() >= LEAST_PIXELS else group
-    ring = grown(group, RING_PX) & ~grown(group, RIM_PX + 2) & target & ~candidates
-    if ring.sum() < LEAST_PIXELS:  # the target's own colour is not visible around it
-        return np.zeros(0), lambda mixed: None
-    rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, group)
+    first = (labels[cut] == label) & candidates
+    core = _eroded(first)
+    core = core if core.sum() >= LEAST_PIXELS else first
+    ring = grown(first, RING_PX) & ~grown(first, RIM_PX + 2) & target & ~candidates
+    if ring.sum() < LEAST_PIXELS:
+        return None
+    rgb = _evenly_lit(cloud.rgb[cut].astype(float), ring, first)
     backdrop = np.median(rgb[ring], axis=0)
     span = np.median(rgb[core], axis=0) - backdrop
     share = (rgb - backdrop) @ span / max(float(span @ span), 1e-12)
     # mosaic and JPEG make neighbours share colour: the scatter of equivalent independent pixels
     scatter = np.mean(share[ring] ** 2)
     blurred_scatter = 25.0 * np.mean(cv2.blur(share, (5, 5))[ring] ** 2)
-    strays = float(np.sqrt(max(scatter, blurred_scatter)))
     # the threshold that found the group only knows the target's colour and leaves gaps at low
     # contrast: take the connected pixels nearer to the group's colour, as far as the surroundings
     # reach
-    group = parts_with((share > 0.5) & target & grown(group, RING_PX), group)
-    rim = grown(group, 1) & ~_eroded(group) & target
-
-    def settled(mixed: bool) -> Blob | None:
-        """Return the blob, pixels weighted by their share of the group's colour if rims are mixed;
-        None if too few."""
-        weights = group.astype(float)
-        if mixed:
-            reach = grown(group, RIM_PX) & target & ~(candidates & ~group)
-            weights = np.where(reach, np.clip(share, 0.0, 1.0), 0.0)
-        v, u = np.nonzero((weights > 0.5) & target)
-        if len(u) < LEAST_PIXELS or min(np.ptp(u), np.ptp(v)) < 1:
-            return None
-        # whether the group may continue where the target has no points
-        around = grown(group, 1) & ~group
-        same_colour = np.linalg.norm(rgb - backdrop - span, axis=-1) < ALIKE * np.linalg.norm(span)
-        beyond_target = around & same_colour & ~target
-        last_row = inside.shape[0] - 1 - row
-        last_column = inside.shape[1] - 1 - column
-        at_side = u.min() == -column or u.max() == last_column
-        at_end = v.min() == -row or v.max() == last_row
-        doubt = ""
-        if beyond_target.sum() > max(2.0, CUT_SHARE * around.sum()):
-            by_crop = (beyond_target & cloud.valid[cut]).sum() > beyond_target.sum() / 2
-            doubt = "cut by the crop's edge" if by_crop else "without range in parts of it"
-        elif at_side or at_end:
-            doubt = "cut by the picture's edge"
-        used_v, used_u = np.nonzero((weights > 0) & target)
-        grid = np.stack([used_u, used_v], axis=1).astype(float)
-        if mixed:
-            # the rim's weights err by `SHARE_SIGMA` and by the scatter of the surroundings'
-            # colours
-            arm = np.argwhere(rim)[:, ::-1] - np.argwhere(group)[:, ::-1].mean(axis=0)
-            area_px = max(float(weights.sum()), 1.0)
-            covariance = (SHARE_SIGMA**2 + strays**2) * arm.T @ arm / area_px**2
-        else:
-            covariance = region_covariance_px2(grid)
-        target_v, target_u = np.nonzero(target)
-        # a count is added to each colour, so that black has a logarithm
-        contrast = np.log((backdrop + span + 1.0) / (backdrop + 1.0))
-        width_px = inside.shape[1]
-        return Blob(
-            pixels=(used_v + row) * width_px + used_u + column,
-            weights=weights[used_v, used_u],
-            grid=grid,
-            grid_covariance=covariance,
-            surroundings=(target_v + row) * width_px + target_u + column,
-            contrast=contrast,
-            doubt=doubt,
-        )
-
-    return share[rim], settled
+    group = parts_with((share > 0.5) & target & grown(first, RING_PX), first)
+    return _Window(
+        cut=cut,
+        target=target,
+        group=group,
+        other_groups=candidates & ~group,
+        rgb=rgb,
+        backdrop=backdrop,
+        span=span,
+        share=share,
+        strays=float(np.sqrt(max(scatter, blurred_scatter))),
+    )
 
 
 def _evenly_lit(

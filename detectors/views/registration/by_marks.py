@@ -254,7 +254,8 @@ class JointState:
 
     def equations(self, data: Sequence[ViewData]) -> tuple[np.ndarray, np.ndarray]:
         """Return matrix and right side of the normal equations of one Gauss-Newton step."""
-        size = 6 * (len(self.T) - 1) + len(TERMS) * (len(self.T) + 1) + self.marks_m.size
+        views = len(self.T)
+        size = 6 * (views - 1) + len(TERMS) * (views + 1) + self.marks_m.size
         matrix = np.zeros((size, size))
         right = np.zeros(size)
         poses, surface, marks, view_terms = self.split(np.arange(size))

@@ -28,7 +28,7 @@ from detectors.rigid_motion import displacement_jacobian, kabsch
 from detectors.views.registration import registered
 from detectors.views.registration.settings import CpdRegistration, IcpRegistration
 from detectors.views.view import PreparedView
-from harness.vocabulary.geometry import MM, Lens, transform_points
+from harness.vocabulary.geometry import MM, Lens, rays_of, transform_points
 
 GUESS_ERROR_M = 10 * MM
 GUESS_ERROR_RAD = np.deg2rad(3.0)
@@ -214,7 +214,9 @@ def coherent_point_drift(
     turn = np.eye(3)
     shift = np.zeros(3)
     # a third of the mean squared distance of all pairs; both clouds have zero mean
-    variance = float((np.sum(fixed**2) / len(fixed) + np.sum(moving**2) / len(moving)) / 3)
+    fixed_square = np.sum(fixed**2) / len(fixed)
+    moving_square = np.sum(moving**2) / len(moving)
+    variance = float((fixed_square + moving_square) / 3)
     outliers = config.outlier_ratio / (1 - config.outlier_ratio) * len(moving) / len(fixed)
     last = 0.0
     change = np.inf
@@ -247,7 +249,8 @@ def coherent_point_drift(
         variance = (spread_x + spread_y - 2 * float(np.sum(cross * d_turn))) / (3 * matched)
         variance = max(variance, LEAST_VARIANCE / 2)
         moved = moving @ d_turn.T + d_shift
-        step = float(np.sqrt(np.mean(np.sum((moved - moving) ** 2, axis=1)))) * scale
+        squares = np.sum((moved - moving) ** 2, axis=1)
+        step = float(np.sqrt(np.mean(squares))) * scale
         moving = moved
         turn = d_turn @ turn
         shift = d_turn @ shift + d_shift
@@ -358,7 +361,8 @@ def posterior_moments(
         greatest = exponents.max(axis=1, keepdims=True)
         weights = np.exp(exponents - greatest)
         with np.errstate(divide="ignore", over="ignore"):
-            full = np.logaddexp(np.log(weights.sum(axis=1)), np.log(background) - greatest[:, 0])
+            log_sum = np.log(weights.sum(axis=1))
+            full = np.logaddexp(log_sum, np.log(background) - greatest[:, 0])
             moments.append(weights @ products / np.exp(full)[:, None])
         objective -= float((full + greatest[:, 0]).sum())
     return np.concatenate(moments).reshape(-1, 4, 4), objective
@@ -380,10 +384,8 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
     # points
     first = views[0].view.cloud.lens
     assert first is not None
-    plane_px = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views]) * (
-        first.fx,
-        first.fy,
-    )
+    slopes = np.concatenate([view.points_m[:, :2] / view.points_m[:, 2:] for view in views])
+    plane_px = slopes * (first.fx, first.fy)
     low = np.floor(plane_px.min(axis=0)) - 1
     width, height = (np.ceil(plane_px.max(axis=0)) + 2 - low).astype(int).tolist()
     canvas = Lens(
@@ -422,9 +424,9 @@ def register_by_odometry(views: Sequence[PreparedView]) -> list[registered.Regis
                     option,
                 )
                 # the information's last diagonal element is the sum of 1 over pairs
-                pairs = (
-                    round(float(information[5, 5])) if success and np.isfinite(step).all() else 0
-                )
+                pairs = 0
+                if success and np.isfinite(step).all():
+                    pairs = round(float(information[5, 5]))
                 pixels = max(
                     int(np.count_nonzero(np.asarray(image.depth))) for image in (now, before)
                 )
@@ -454,8 +456,9 @@ def _image(
     lens = cloud.lens
     assert lens is not None and cloud.rgb is not None
     slopes = canvas.region_slopes(canvas.whole)
-    pixels = lens.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1))
-    u, v = (pixels - [cloud.region.col0, cloud.region.row0]).astype(np.float32).transpose(2, 0, 1)
+    corner_px = (cloud.region.col0, cloud.region.row0)
+    pixels = (lens.project(rays_of(slopes)) - corner_px).astype(np.float32)
+    u, v = pixels.transpose(2, 0, 1)
     z = np.where(view.inside, cloud.points_m[..., 2], 0.0).astype(np.float32)
     # depth is not interpolated: a mean of target and background is neither of them
     depth = cv2.remap(z, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

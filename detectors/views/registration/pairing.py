@@ -324,9 +324,11 @@ def _holding(
         offset = placed[:, :, None, :] - larger_side.places[None, None]
         square = (offset**2).sum(axis=-1) / worst
         partner = _mutual(np.where(square < FIT_CHI2, square, np.inf))
-        squares = np.take_along_axis(square, np.maximum(partner, 0)[..., None], axis=-1)[..., 0]
-        count = (partner >= 0).sum(axis=1)
-        misfit = np.where(partner >= 0, squares, 0.0).sum(axis=1) / np.maximum(count, 1)
+        has_partner = partner >= 0
+        column = np.where(has_partner, partner, 0)[..., None]
+        squares = np.take_along_axis(square, column, axis=-1)[..., 0]
+        count = has_partner.sum(axis=1)
+        misfit = np.where(has_partner, squares, 0.0).sum(axis=1) / np.maximum(count, 1)
         enough = count >= least
         T = T[enough]
         partner = partner[enough]

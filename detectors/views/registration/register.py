@@ -138,8 +138,9 @@ def judge(
     """Return the registration with its overlap and, if it cannot be trusted, a ``failure`` or
     note."""
     T = registration.T_reference_view
-    is_rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
-    if not is_rigid or np.linalg.det(T[:3, :3]) < 0:
+    R = T[:3, :3]
+    is_rigid = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+    if not is_rigid or np.linalg.det(R) < 0:
         broken = "no transform was found"
         if is_rigid:
             broken = "mirrored: the transform is a reflection, not a rotation"
@@ -193,14 +194,16 @@ def _jump(
     if guess is None:
         return ""
     change = registration.T_reference_view @ invert(guess)
-    turn = np.rad2deg(np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1.0, 1.0)))
+    # the trace of a rotation is 1 + 2 cos of its angle
+    cosine = (np.trace(change[:3, :3]) - 1) / 2
+    turn_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
     centre = view.points_m.mean(axis=0)
     placed = transform_points(registration.T_reference_view, centre)
     shift = np.linalg.norm(placed - transform_points(guess, centre))
-    if turn <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
+    if turn_deg <= MAX_JUMP_DEG and shift <= MAX_JUMP_M:
         return ""
     return (
-        f"is {turn:.0f} degrees and {shift / MM:.0f} mm away from its guess (up to "
+        f"is {turn_deg:.0f} degrees and {shift / MM:.0f} mm away from its guess (up to "
         f"{MAX_JUMP_DEG:.0f} degrees and {MAX_JUMP_M / MM:.0f} mm are credible): marks matched "
         "wrongly, another target, or a wrong guess"
     )

@@ -154,57 +154,16 @@ def _fitted(image: RangeImage, gauge: SolidGauge, fit: RangeFit) -> RangeFit:
 def _improved(image: RangeImage, gauge: SolidGauge, fit: RangeFit) -> RangeFit:
     """Return the fit after one step of least squares."""
     corrected = replace(image, range_m=(image.range_m - fit.bias_m) / fit.scale)
-    T = fit.T_camera_gauge
-    place_m = gauge.uncertainty.place_mm * MM
-    middle_m = T[:3, 3]
-    rows = []
-    wanted = []
-    spheres = []
-    for ball, centre_mm in zip(gauge.spheres, gauge.centres_mm, strict=True):
-        expected_m = transform_points(T, centre_mm * MM)
-        sphere = fit_sphere(corrected, expected_m, ball.diameter_mm / 2 * MM)
-        spheres.append(sphere)
-        if isinstance(sphere, NoFit):
-            continue
-        ray = sphere.centre_m / np.linalg.norm(sphere.centre_m)
-        by_pose = displacement_jacobian(expected_m[None], middle_m)[0]
-        by_range = np.column_stack([sphere.centre_m, ray]) / fit.scale
-        design = np.concatenate([by_pose, by_range], axis=1)
-        covariance_m2 = sphere.covariance_m2 + place_m**2 * np.eye(3)
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance_m2))
-        rows.append(whiten @ design)
-        wanted.append(whiten @ (sphere.centre_m - expected_m))
-    levels = []
-    normal = rotate_vectors(T, np.array([0.0, 0.0, 1.0]))
-    for level, pixels in level_pixels(corrected, gauge, T):
-        rays = image.rays.reshape(-1, 3)[pixels]
-        ranges_m = corrected.range_m.ravel()[pixels]
-        point_m = transform_points(T, np.array([0.0, 0.0, level.z_m]))
-        off_m = ranges_m - (normal @ point_m) / (rays @ normal)
-        centred_m = off_m - np.median(off_m)
-        kept = np.abs(centred_m) <= OUTLIER * 1.4826 * np.median(np.abs(centred_m)) + 1e-9
-        if kept.sum() < FEWEST_PX:
-            continue
-        shape = image.range_m.shape
-        mean_m = float(off_m[kept].mean())
-        shared = correlated_pixels(shape, pixels[kept], off_m[kept] - mean_m, numbers=1)
-        sigma_m = float(off_m[kept].std() * np.sqrt(shared / kept.sum()))
-        levels.append((level, mean_m, sigma_m))
-        points_m = rays[kept] * ranges_m[kept, None]
-        slant = rays[kept] @ normal
-        along = displacement_jacobian(points_m, middle_m)
-        by_pose = (np.einsum("j,njk->nk", normal, along) / slant[:, None]).mean(axis=0)
-        by_range = np.array([ranges_m[kept].mean(), 1.0]) / fit.scale
-        error_m = np.hypot(sigma_m, place_m)
-        rows.append(np.concatenate([by_pose, by_range])[None] / error_m)
-        wanted.append(np.array([mean_m / error_m]))
-    if len(rows) < NUMBERS:
+    spheres, of_spheres = _sphere_equations(corrected, gauge, fit)
+    levels, of_levels = _level_equations(corrected, gauge, fit)
+    equations = [*of_spheres, *of_levels]
+    if len(equations) < NUMBERS:
         raise UserError(
-            f"--gauge: {len(rows)} elements of the gauge have enough pixels, {NUMBERS} needed",
+            f"--gauge: {len(equations)} elements of the gauge have enough pixels, {NUMBERS} needed",
             fix="come closer, or record more frames",
         )
-    design = np.concatenate(rows)
-    target = np.concatenate(wanted)
+    design = np.concatenate([equation.design for equation in equations])
+    target = np.concatenate([equation.target for equation in equations])
     kept = np.ones(len(target), bool)
     for _ in range(3):
         step, *_ = np.linalg.lstsq(design[kept], target[kept], rcond=None)
@@ -218,8 +177,9 @@ def _improved(image: RangeImage, gauge: SolidGauge, fit: RangeFit) -> RangeFit:
     birge = max(float(np.sqrt((left**2).sum() / degrees)), 1.0)
     covariance = np.linalg.inv(design.T @ design)[6:, 6:] * birge**2
     covariance[0, 0] += (fit.scale * gauge.uncertainty.scale) ** 2
+    T = fit.T_camera_gauge
     return RangeFit(
-        T_camera_gauge=moved_by(step[:6], middle_m) @ T,
+        T_camera_gauge=moved_by(step[:6], T[:3, 3]) @ T,
         scale=fit.scale + float(step[6]),
         bias_m=fit.bias_m + float(step[7]),
         covariance=covariance,
@@ -228,6 +188,76 @@ def _improved(image: RangeImage, gauge: SolidGauge, fit: RangeFit) -> RangeFit:
         spheres=tuple(spheres),
         levels=tuple(levels),
     )
+
+
+class _Equations(NamedTuple):
+    """What an element says about the numbers of a fit, over its standard error."""
+
+    design: np.ndarray
+    """(k, `NUMBERS`): derivatives by the motion about the gauge's origin, scale and bias."""
+    target: np.ndarray
+    """(k,): where the element was measured, less where the fit expects it."""
+
+
+def _sphere_equations(
+    image: RangeImage, gauge: SolidGauge, fit: RangeFit
+) -> tuple[list[SphereFit | NoFit], list[_Equations]]:
+    """Return the spheres as they are measured, and the equations (3 each) of their centres.
+    ``image``: corrected by scale and bias of the fit."""
+    T = fit.T_camera_gauge
+    place_m = gauge.uncertainty.place_mm * MM
+    spheres: list[SphereFit | NoFit] = []
+    equations = []
+    for ball, centre_mm in zip(gauge.spheres, gauge.centres_mm, strict=True):
+        expected_m = transform_points(T, centre_mm * MM)
+        sphere = fit_sphere(image, expected_m, ball.diameter_mm / 2 * MM)
+        spheres.append(sphere)
+        if isinstance(sphere, NoFit):
+            continue
+        ray = sphere.centre_m / np.linalg.norm(sphere.centre_m)
+        by_pose = displacement_jacobian(expected_m[None], T[:3, 3])[0]
+        by_range = np.column_stack([sphere.centre_m, ray]) / fit.scale
+        design = np.concatenate([by_pose, by_range], axis=1)
+        covariance_m2 = sphere.covariance_m2 + place_m**2 * np.eye(3)
+        whiten = np.linalg.inv(np.linalg.cholesky(covariance_m2))
+        equations.append(_Equations(whiten @ design, whiten @ (sphere.centre_m - expected_m)))
+    return spheres, equations
+
+
+def _level_equations(
+    image: RangeImage, gauge: SolidGauge, fit: RangeFit
+) -> tuple[list[tuple[FlatLevel, float, float]], list[_Equations]]:
+    """Return the levels, with mean and standard error of what they lie behind their places, and an
+    equation for each. ``image``: corrected by scale and bias of the fit."""
+    T = fit.T_camera_gauge
+    place_m = gauge.uncertainty.place_mm * MM
+    normal = rotate_vectors(T, np.array([0.0, 0.0, 1.0]))
+    levels = []
+    equations = []
+    for level, pixels in level_pixels(image, gauge, T):
+        rays = image.rays.reshape(-1, 3)[pixels]
+        ranges_m = image.range_m.ravel()[pixels]
+        point_m = transform_points(T, np.array([0.0, 0.0, level.z_m]))
+        off_m = ranges_m - (normal @ point_m) / (rays @ normal)
+        centred_m = off_m - np.median(off_m)
+        kept = np.abs(centred_m) <= OUTLIER * 1.4826 * np.median(np.abs(centred_m)) + 1e-9
+        if kept.sum() < FEWEST_PX:
+            continue
+        mean_m = float(off_m[kept].mean())
+        shared = correlated_pixels(
+            image.range_m.shape, pixels[kept], off_m[kept] - mean_m, numbers=1
+        )
+        sigma_m = float(off_m[kept].std() * np.sqrt(shared / kept.sum()))
+        levels.append((level, mean_m, sigma_m))
+        points_m = rays[kept] * ranges_m[kept, None]
+        slant = rays[kept] @ normal
+        along = displacement_jacobian(points_m, T[:3, 3])
+        by_pose = (np.einsum("j,njk->nk", normal, along) / slant[:, None]).mean(axis=0)
+        by_range = np.array([ranges_m[kept].mean(), 1.0]) / fit.scale
+        error_m = np.hypot(sigma_m, place_m)
+        design = np.concatenate([by_pose, by_range])[None] / error_m
+        equations.append(_Equations(design, np.array([mean_m / error_m])))
+    return levels, equations
 
 
 # ---------------------------------------------------------------- pixels of the elements

@@ -18,7 +18,7 @@ from harness.experiment.schema import Experiment, ExperimentConfig, Point, Simul
 from harness.programs.coverage.statistics import Findable, Patches, ScoredDamage, Seen, findable
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import render_missing, values_of
-from harness.runs.jobs import JobEngine
+from harness.runs.jobs import JobEngine, Outcome
 from harness.runs.journal import Journal
 from harness.runs.plan import Batch, Group, SweepPlan, batch_of, plan_of, trial_point
 from harness.runs.run import run_plan
@@ -75,71 +75,84 @@ def survey(
         tuple(_widened(group, poses) for group in plan_of(experiment, cache, folder).groups)
     )
     journal = Journal(folder / "journal")
-    scores = dict[tuple[str, int, int, str], list[float]]()
     with progress_display() as report:
         outcome = run_plan(plan, journal, engine, report)
-    for entry in map(journal.read, outcome.finished):
-        if entry is None or not entry.record:
-            continue
-        for row in entry.record.get("holes", ()):
-            damage_key = (row["variant"], row["frames"], row["board"], row["hole"])
-            missed = np.inf if row["no_return"] else np.nan
-            scores.setdefault(damage_key, []).append(row["score"] if row["detected"] else missed)
+    scores = _scores_of(outcome, journal)
     surveys = []
     for group in plan.groups:
         source, family = declared(group.points[0].config)
         patches = patches_of(family.board)
         target = family.drawn("hole_free", 0)
         wholes = [_bare(batch) for batch in group.then]
-        configs = [
-            PoseConfig(distance_m=distance_m, tilt_x_deg=x, tilt_y_deg=y)
-            for distance_m, x, y in poses
-        ]
-        placed = (target.model_copy(update={"pose": pose}) for pose in configs)
-        views = [batch_of(board, "hole_free", source, cache, 0) for board in placed]
-        if lost := render_missing(
-            (job for batch in (*wholes, *views) for job in batch.renders), engine
-        ):
+        views = []
+        for distance_m, tilt_x_deg, tilt_y_deg in poses:
+            pose = PoseConfig(distance_m=distance_m, tilt_x_deg=tilt_x_deg, tilt_y_deg=tilt_y_deg)
+            board = target.model_copy(update={"pose": pose})
+            views.append(batch_of(board, "hole_free", source, cache, 0))
+        renders = [job for batch in (*wholes, *views) for job in batch.renders]
+        if lost := render_missing(renders, engine):
             raise UserError(f"a view could not be rendered: {lost[0].in_short}")
         for point in group.points:
-            if point.digest not in outcome.thresholds:
-                why = next(
-                    (failure.in_short for failure in outcome.failures), "no hole-free run ended"
-                )
-                raise UserError(f"{point.label or point.variant} has no threshold: {why}")
-            task = trial_point(
-                point, outcome.thresholds[point.digest], group.learned.get(point.digest)
-            )
+            threshold = _threshold_of(point, outcome)
+            task = trial_point(point, threshold, group.learned.get(point.digest))
             pairs = [(*pair, task, group.seed) for pair in zip(group.then, wholes, strict=True)]
             boards = values_of(_board_seen, pairs, engine)
             inspections = _inspections(
                 [board for board in boards if board is not None], point, scores
             )
-            findable_sizes = findable(inspections, outcome.thresholds[point.digest])
-            blind = np.full(len(patches.areas_m2), np.inf)
+            law = findable(inspections, threshold)
             seen_of_views = values_of(
                 _part_seen, [(view, task, group.seed, patches) for view in views], engine
             )
             visibility = {}
-            for pose, seen_of_view in zip(poses, seen_of_views, strict=True):
+            for pose_of_view, seen_of_view in zip(poses, seen_of_views, strict=True):
                 if seen_of_view is None:
-                    seen_of_view = Seen(
-                        deviation_m=blind,
-                        cosine=np.ones(len(blind)),
-                        range_m=np.ones(len(blind)),
-                        residual_m=np.zeros(len(blind)),
-                    )
-                visibility[pose] = seen_of_view
+                    seen_of_view = _unseen(len(patches.areas_m2))
+                visibility[pose_of_view] = seen_of_view
             surveys.append(
                 Survey(
                     point=point,
                     task=task,
                     patches=patches,
-                    findable=findable_sizes,
+                    findable=law,
                     visibility=visibility,
                 )
             )
     return surveys
+
+
+def _scores_of(outcome: Outcome, journal: Journal) -> dict[tuple[str, int, int, str], list[float]]:
+    """Return the scores of all finished trials by variant, frames, board and damage: NaN where it
+    was missed, infinite where only missing returns found it."""
+    scores: dict[tuple[str, int, int, str], list[float]] = {}
+    for key in outcome.finished:
+        entry = journal.read(key)
+        if entry is None or not entry.record:
+            continue
+        for row in entry.record.get("holes", ()):
+            damage_key = (row["variant"], row["frames"], row["board"], row["hole"])
+            missed = np.inf if row["no_return"] else np.nan
+            scores.setdefault(damage_key, []).append(row["score"] if row["detected"] else missed)
+    return scores
+
+
+def _threshold_of(point: Point, outcome: Outcome) -> float:
+    """Return the calibrated threshold of a point. Raises UserError if there is none."""
+    if point.digest not in outcome.thresholds:
+        reasons = (failure.in_short for failure in outcome.failures)
+        why = next(reasons, "no hole-free run ended")
+        raise UserError(f"{point.label or point.variant} has no threshold: {why}")
+    return outcome.thresholds[point.digest]
+
+
+def _unseen(count: int) -> Seen:
+    """Return the view of so many places of which nothing is judged."""
+    return Seen(
+        deviation_m=np.full(count, np.inf),
+        cosine=np.ones(count),
+        range_m=np.ones(count),
+        residual_m=np.zeros(count),
+    )
 
 
 def patches_of(board: BoardConfig) -> Patches:

@@ -7,6 +7,7 @@ captures are not included."""
 import io
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from harness.programs.dataset.stored import (
 )
 from harness.records.rows import Role
 from harness.runs.plan import RenderJob, batch_of, trial_point, unit_of
-from harness.trials.board import load_board
+from harness.trials.board import LabelledCloud, load_board
 from harness.trials.trial import Trial, cloud_of
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import (
@@ -45,7 +46,7 @@ from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target.drawn import DrawnTargetConfig
-from scenes.target.truth import truth_of
+from scenes.target.truth import Damage, truth_of
 
 DATASET_VERSION = 1  # written into ``dataset.json``; increased when the meaning of a file changes
 INDEX = "dataset.json"
@@ -83,7 +84,16 @@ class Sample:
     @property
     def name(self) -> str:
         """The board's place in the data set: ``category/split/label/number``."""
-        return f"{self.category}/{self.split}/{self.label}/{self.number:04d}"
+        return f"{self.category}/{self.split}/{self.label}/{self.file}"
+
+    @property
+    def file(self) -> str:
+        """The name of the board's folder and pictures."""
+        return f"{self.number:04d}"
+
+    def folder(self, out: Path) -> Path:
+        """The board's own folder in the data set ``out``."""
+        return out / "boards" / self.name
 
 
 def categories_of(experiment: Experiment) -> dict[str, Point]:
@@ -176,72 +186,14 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
     labelled = set_up.labelled(cloud_of(sample.task, point))
     cloud = labelled.cloud
     truth = () if sample.task.hole_free else labelled.truth
-
-    def put(values: np.ndarray, outside: float) -> np.ndarray:
-        return on_window(values, cloud.region, window, outside)
-
-    damage = np.zeros(cloud.region.shape, np.uint16)
-    for flaw in truth:
-        damage.ravel()[labelled.outlines[flaw.id]] = flaw.id
-    intensity = np.zeros(damage.shape)
-    if cloud.amplitude is not None:
-        intensity = np.nan_to_num(cloud.amplitude)
-    inspected = shrunk(np.isfinite(labelled.places_m[..., 0]), 2 * INSET_PX + 1)
-    arrays = {
-        "points_m": put(cloud.points_m.astype(np.float32), np.nan),
-        "intensity": put(intensity.astype(np.float32), 0.0),
-        "reason": put(cloud.reason, Reason.OUTSIDE_MASK),
-        "count": put(cloud.count.astype(np.uint16), 0),
-        "damage": put(damage, 0),
-        "inspected": put(inspected, False),
-        "board_xy_m": put(labelled.places_m.astype(np.float32), np.nan),
-    }
-    mask = arrays["damage"]
-    points = arrays["points_m"]
-    valid = np.isfinite(points[..., 2])
+    arrays = _arrays(labelled, truth, window)
     white = float(np.quantile(arrays["intensity"], BRIGHTEST)) or 1.0
-    shown = np.clip(arrays["intensity"] / white, 0, 1)
-    grey = np.repeat(np.rint(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
-    grey_16_bits = np.rint(65535 * shown).astype(np.uint16)
-    z_y_x = np.where(valid[..., None], points, 0)[..., ::-1]
-    file = f"{sample.number:04d}"
-    folder = out / "boards" / Path(sample.name).parent / file
-    mvtec = out / Path(sample.name).parent
-    stored = io.BytesIO()
-    np.savez_compressed(stored, **arrays)  # type: ignore[arg-type]
-    files = {
-        folder / CLOUD: stored.getvalue(),
-        folder / "depth.png": picture_bytes(".png", depth_units(points[..., 2])),
-        folder / "intensity.png": picture_bytes(".png", grey_16_bits),
-        folder / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
-        folder / "mask.png": picture_bytes(".png", mask),
-        mvtec / "rgb" / f"{file}.png": picture_bytes(".png", grey),
-        # OpenCV stores the channels of a picture in reverse
-        mvtec / "xyz" / f"{file}.tiff": picture_bytes(".tiff", z_y_x),
-    }
-    if sample.split == "test":
-        files[mvtec / "gt" / f"{file}.png"] = picture_bytes(".png", np.uint8(255) * (mask > 0))
-    for path, content in files.items():
+    for path, content in _files(out, sample, arrays, white).items():
         write_bytes(path, content, durable=False)
     camera = sample.task.views[0].camera
-    damages = []
-    for flaw in truth:
-        damage_mask = np.zeros(damage.shape, bool)
-        damage_mask.ravel()[labelled.outlines[flaw.id]] = True
-        damage_mask = put(damage_mask, False)
-        rows, columns = np.nonzero(damage_mask)
-        box = (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)
-        facts = {
-            **flaw.to_row(),
-            "seen_depth_mm": labelled.seen_depth_m[flaw.id] / MM,
-            "pixels": len(rows),
-            "bbox": [int(length_px) for length_px in box],
-            "run_lengths": run_lengths(damage_mask),
-            "line_m": flaw.line_m.tolist(),
-        }
-        damages.append(facts)
+    picture = f"{sample.category}/{sample.split}/{sample.label}/rgb/{sample.file}.png"
     facts_of_board = {
-        "file_name": f"{sample.category}/{sample.split}/{sample.label}/rgb/{file}.png",
+        "file_name": picture,
         "height": window.shape[0],
         "width": window.shape[1],
         "board": sample.number,
@@ -252,10 +204,87 @@ def write_board(out: Path, sample: Sample, window: Region) -> None:
         "window_px": asdict(window),
         "T_camera_board": set_up.T_camera_board.tolist(),
         "intensity_at_65535": white,
-        "damages": damages,
+        "damages": [_facts_of(flaw, labelled, window) for flaw in truth],
     }
     truth_text = json.dumps(facts_of_board, allow_nan=False) + "\n"
-    write_text(folder / TRUTH, truth_text, durable=False)
+    write_text(sample.folder(out) / TRUTH, truth_text, durable=False)
+
+
+def _arrays(
+    labelled: LabelledCloud, truth: Sequence[Damage], window: Region
+) -> dict[str, np.ndarray]:
+    """Return the arrays of `CLOUD` by name, on the window."""
+    cloud = labelled.cloud
+    damage = np.zeros(cloud.region.shape, np.uint16)
+    for flaw in truth:
+        damage.ravel()[labelled.outlines[flaw.id]] = flaw.id
+    intensity = np.zeros(cloud.region.shape)
+    if cloud.amplitude is not None:
+        intensity = np.nan_to_num(cloud.amplitude)
+    inspected = shrunk(np.isfinite(labelled.places_m[..., 0]), 2 * INSET_PX + 1)
+
+    def put(values: np.ndarray, outside: float) -> np.ndarray:
+        return on_window(values, cloud.region, window, outside)
+
+    return {
+        "points_m": put(cloud.points_m.astype(np.float32), np.nan),
+        "intensity": put(intensity.astype(np.float32), 0.0),
+        "reason": put(cloud.reason, Reason.OUTSIDE_MASK),
+        "count": put(cloud.count.astype(np.uint16), 0),
+        "damage": put(damage, 0),
+        "inspected": put(inspected, False),
+        "board_xy_m": put(labelled.places_m.astype(np.float32), np.nan),
+    }
+
+
+def _files(
+    out: Path, sample: Sample, arrays: dict[str, np.ndarray], white: float
+) -> dict[Path, bytes]:
+    """Return the contents of a board's files but its truth. ``white``: the intensity that pictures
+    show as white."""
+    mask = arrays["damage"]
+    points_m = arrays["points_m"]
+    valid = np.isfinite(points_m[..., 2])
+    shown = np.clip(arrays["intensity"] / white, 0, 1)
+    grey = np.repeat(np.rint(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
+    grey_16_bits = np.rint(65535 * shown).astype(np.uint16)
+    z_y_x = np.where(valid[..., None], points_m, 0)[..., ::-1]
+    stored = io.BytesIO()
+    np.savez_compressed(stored, **arrays)  # type: ignore[arg-type]
+    folder = sample.folder(out)
+    mvtec = out / Path(sample.name).parent
+    files = {
+        folder / CLOUD: stored.getvalue(),
+        folder / "depth.png": picture_bytes(".png", depth_units(points_m[..., 2])),
+        folder / "intensity.png": picture_bytes(".png", grey_16_bits),
+        folder / "valid.png": picture_bytes(".png", np.uint8(255) * valid),
+        folder / "mask.png": picture_bytes(".png", mask),
+        mvtec / "rgb" / f"{sample.file}.png": picture_bytes(".png", grey),
+        # OpenCV stores the channels of a picture in reverse
+        mvtec / "xyz" / f"{sample.file}.tiff": picture_bytes(".tiff", z_y_x),
+    }
+    if sample.split == "test":
+        is_damaged = picture_bytes(".png", np.uint8(255) * (mask > 0))
+        files[mvtec / "gt" / f"{sample.file}.png"] = is_damaged
+    return files
+
+
+def _facts_of(flaw: Damage, labelled: LabelledCloud, window: Region) -> dict[str, Any]:
+    """Return what the truth of a board says about one damage."""
+    region = labelled.cloud.region
+    is_damaged = np.zeros(region.shape, bool)
+    is_damaged.ravel()[labelled.outlines[flaw.id]] = True
+    mask = on_window(is_damaged, region, window, False)
+    rows, columns = np.nonzero(mask)
+    box_px = (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)
+    return {
+        **flaw.to_row(),
+        "seen_depth_mm": labelled.seen_depth_m[flaw.id] / MM,
+        "pixels": len(rows),
+        "bbox": [int(length_px) for length_px in box_px],
+        "run_lengths": run_lengths(mask),
+        "line_m": flaw.line_m.tolist(),
+    }
 
 
 def read_index(folder: Path) -> dict[str, Any]:

@@ -162,7 +162,7 @@ def _written(out: Path, samples: list[Sample], engine: JobEngine) -> list[str]:
     outcome = Outcome()
     failures = list[str]()
     renders = {sample.render.path: sample.render for sample in samples}
-    missing = [sample for sample in samples if not (out / "boards" / sample.name / TRUTH).exists()]
+    missing = [sample for sample in samples if not (sample.folder(out) / TRUTH).exists()]
     outcome.renders.total = len(renders)
     outcome.trials.total = len(samples)
     outcome.trials.found = len(samples) - len(missing)

@@ -13,7 +13,8 @@ AU-PRO is the area under the mean overlap of damages against the share of false 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,6 +215,38 @@ def _read(path: Path) -> np.ndarray:
     return np.asarray(values, float)
 
 
+@dataclass(frozen=True, eq=False)
+class ScoredPicture:
+    """A picture with the map that a method made of it."""
+
+    name: str
+    """Name of the picture."""
+    picture: JudgedPicture
+    """The picture with its truth."""
+    scores: np.ndarray
+    """Scores (h, w); NaN if not inspected."""
+    area_m2: float
+    """Inspected area of the face."""
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedMap:
+    """A map above the threshold, matched with the damages of its picture."""
+
+    truth: list[Any]
+    """Number of the board, and its damages."""
+    run: dict[str, Any]
+    """The row of its run, as `harness.runs.study_record.set_up_of` takes it."""
+    holes: list[dict[str, Any]]
+    """The rows of its damages."""
+    scores: np.ndarray
+    """Scores (n,) of the inspected pixels."""
+    damage: np.ndarray
+    """Numbers (n,) of their damages; 0: none."""
+    highest: float
+    """Highest of the scores; NaN if there are none."""
+
+
 def _judged(
     category: str,
     maps: dict[str, Path],
@@ -225,109 +258,135 @@ def _judged(
     scores."""
     import pandas as pd
 
-    from harness.evaluation.intervals import threshold_for_rate
     from harness.evaluation.study.limit import limit_of
     from harness.runs.study_record import set_up_of
-    from harness.trials.board import highest_within, pixel_areas
-    from harness.trials.judge import matched_places, smeared
-
-    def pictures(start: str) -> Iterator[tuple[str, np.ndarray, JudgedPicture, float]]:
-        """Yield the pictures whose name starts so: name, scores (NaN if not inspected), picture,
-        inspected area."""
-        for sample in sorted(name for name in maps if name.startswith(f"{category}/{start}")):
-            picture = data.picture(sample)
-            scores = np.where(picture.inspected, _read(maps[sample]), np.nan)
-            area_m2 = float(np.nansum(pixel_areas(picture.places_m)[picture.inspected]))
-            yield sample, scores, picture, area_m2
 
     quiet_split = data.quiet_split(category, list(maps))
-    quiet = [
-        (np.nanmax(scores), area_m2) for _, scores, _, area_m2 in pictures(f"{quiet_split}/good/")
-    ]
-    highest, areas_m2 = np.array(quiet, float).T
-    if rate is None:
-        rate = float(-np.log1p(-CALLING_SHARE) / areas_m2.mean())
-    threshold = threshold_for_rate(highest, float(areas_m2.mean()), rate).value
-    radius_m = data.hit_radius_mm * MM
-    overlap = data.hit_overlap
-    truths = []
-    holes = list[dict[str, Any]]()
-    runs = list[dict[str, Any]]()
-    pixels = list[np.ndarray]()
-    regions = list[np.ndarray]()
-    tops = list[tuple[float, bool]]()
-    for name, scores, picture, area_m2 in pictures("test/"):
-        places_m = picture.places_m
-        damage = picture.damage
-        board, damages = data.damages(name)
-        truths.append([board, damages])
-        lines = [np.array(flaw["line_m"]) for flaw in damages]
-        findings = _findings(places_m, scores > threshold, picture.link_m)
-        outlines = [np.flatnonzero(damage == flaw["id"]) for flaw in damages]
-        areas = [] if overlap is None else smeared(outlines, damage.shape)
-        ((pairs, parts),) = matched_places(
-            lines, areas, lambda centres_m: centres_m, [findings], radius_m, overlap
-        )
-        signals = highest_within(places_m, scores, lines, radius_m)
-        common: dict[str, Any] = {
-            "board": board,
-            "repeat": 0,
-            "threshold": float(threshold),
-            "scale_mm": np.nan,
-        }
-        run = {
-            **common,
-            "role": "hole_free" if "/good/" in name else "damaged",
-            "false_calls": len(findings.scores) - len(pairs) - parts,
-            "no_return_calls": 0,
-            "inspected_m2": area_m2,
-        }
-        runs.append(run)
-        for number, flaw in enumerate(damages):
-            hole = {
-                **common,
-                "hole": str(flaw["id"]),
-                "true_diameter_mm": flaw["diameter_mm"],
-                "true_depth_mm": flaw["depth_mm"],
-                "true_x_mm": flaw["x_board_mm"],
-                "true_y_mm": flaw["y_board_mm"],
-                "signal": float(signals[number]),
-                "detected": number in pairs,
-                "no_return": False,
-                "size_of": flaw.get("size_of", "diameter"),
-            }
-            holes.append(hole)
-        is_scored = np.isfinite(scores)
-        pixels.append(scores[is_scored])
-        damage_ids = damage[is_scored].astype(int)
-        # a damage's number is unique only on its board
-        regions.append(np.where(damage_ids > 0, damage_ids + (len(truths) << 16), 0))
-        tops.append((float(np.nanmax(scores)), bool(damages)))
-
+    quiet = _scored(maps, data, f"{category}/{quiet_split}/good/")
+    threshold, quiet_count = _threshold(quiet, rate)
+    judged = []
+    for scored in _scored(maps, data, f"{category}/test/"):
+        judged.append(_judged_map(scored, data, threshold))
+    holes = [hole for one_map in judged for hole in one_map.holes]
     if not holes:
         raise UserError(
             f"{data.name}: {category} has no damage in view, so there is no limit to state"
         )
     record = set_up_of(
         pd.DataFrame(holes),
-        pd.DataFrame(runs),
+        pd.DataFrame([one_map.run for one_map in judged]),
         variant=category,
         frames=data.categories[category]["frames"],
         detector=options.name,
-        calibration_runs=len(highest),
-        targets_digest=digest(truths),
+        calibration_runs=quiet_count,
+        targets_digest=digest([one_map.truth for one_map in judged]),
         frames_digest=digest([data.content, category]),
     )
-    scores = np.concatenate(pixels)
+    return limit_of(record), {"category": category, **_areas(judged)}
+
+
+def _scored(maps: dict[str, Path], data: JudgedSet, start: str) -> Iterator[ScoredPicture]:
+    """Yield the pictures whose name starts so."""
+    from harness.trials.board import pixel_areas
+
+    for name in sorted(name for name in maps if name.startswith(start)):
+        picture = data.picture(name)
+        scores = np.where(picture.inspected, _read(maps[name]), np.nan)
+        area_m2 = float(np.nansum(pixel_areas(picture.places_m)[picture.inspected]))
+        yield ScoredPicture(name, picture, scores, area_m2)
+
+
+def _threshold(quiet: Iterable[ScoredPicture], rate: float | None) -> tuple[float, int]:
+    """Return the threshold with this rate of false calls per square metre on good pictures, and
+    their number. Without a rate, a share `CALLING_SHARE` of them calls."""
+    from harness.evaluation.intervals import threshold_for_rate
+
+    highest = []
+    areas_m2 = []
+    for scored in quiet:
+        highest.append(np.nanmax(scored.scores))
+        areas_m2.append(scored.area_m2)
+    area_m2 = float(np.mean(areas_m2))
+    if rate is None:
+        # calls are as rare as in a Poisson process of this rate
+        rate = float(-np.log1p(-CALLING_SHARE) / area_m2)
+    threshold = threshold_for_rate(np.array(highest, float), area_m2, rate).value
+    return float(threshold), len(highest)
+
+
+def _judged_map(scored: ScoredPicture, data: JudgedSet, threshold: float) -> JudgedMap:
+    """Judge a map at a threshold."""
+    from harness.trials.board import highest_within
+    from harness.trials.judge import matched_places, smeared
+
+    picture = scored.picture
+    radius_m = data.hit_radius_mm * MM
+    overlap = data.hit_overlap
+    board, damages = data.damages(scored.name)
+    lines_m = [np.array(flaw["line_m"]) for flaw in damages]
+    outlines = [np.flatnonzero(picture.damage == flaw["id"]) for flaw in damages]
+    areas = [] if overlap is None else smeared(outlines, picture.damage.shape)
+    findings = _findings(picture.places_m, scored.scores > threshold, picture.link_m)
+    ((pairs, parts),) = matched_places(
+        lines_m, areas, lambda centres_m: centres_m, [findings], radius_m, overlap
+    )
+    common: dict[str, Any] = {
+        "board": board,
+        "repeat": 0,
+        "threshold": threshold,
+        "scale_mm": np.nan,
+    }
+    run = {
+        **common,
+        "role": "hole_free" if "/good/" in scored.name else "damaged",
+        "false_calls": len(findings.scores) - len(pairs) - parts,
+        "no_return_calls": 0,
+        "inspected_m2": scored.area_m2,
+    }
+    signals = highest_within(picture.places_m, scored.scores, lines_m, radius_m)
+    holes = []
+    for number, flaw in enumerate(damages):
+        hole = {
+            **common,
+            "hole": str(flaw["id"]),
+            "true_diameter_mm": flaw["diameter_mm"],
+            "true_depth_mm": flaw["depth_mm"],
+            "true_x_mm": flaw["x_board_mm"],
+            "true_y_mm": flaw["y_board_mm"],
+            "signal": float(signals[number]),
+            "detected": number in pairs,
+            "no_return": False,
+            "size_of": flaw.get("size_of", "diameter"),
+        }
+        holes.append(hole)
+    is_scored = np.isfinite(scored.scores)
+    return JudgedMap(
+        truth=[board, damages],
+        run=run,
+        holes=holes,
+        scores=scored.scores[is_scored],
+        damage=picture.damage[is_scored].astype(int),
+        highest=float(np.nanmax(scored.scores)),
+    )
+
+
+def _areas(judged: Sequence[JudgedMap]) -> dict[str, float]:
+    """Return AU-PRO and AUROC of the pixels, and AUROC of the boards by their highest scores."""
+    regions = []
+    for number, one_map in enumerate(judged, start=1):
+        # a damage's number is unique only on its board
+        on_board = one_map.damage + (number << 16)
+        regions.append(np.where(one_map.damage > 0, on_board, 0))
     region = np.unique(np.concatenate(regions), return_inverse=True)[1]
+    scores = np.concatenate([one_map.scores for one_map in judged])
     damaged = (region > 0) * 1.0
     share_of_damage = damaged / np.bincount(region)[region]
-    top, is_flawed = np.array(tops, float).T
-    return limit_of(record), {
-        "category": category,
+    highest = np.array([one_map.highest for one_map in judged])
+    is_flawed = np.array([bool(one_map.holes) for one_map in judged], float)
+    return {
         "au_pro": area_under(scores, share_of_damage, 1 - damaged, PRO_LIMIT),
         "pixel_auroc": area_under(scores, damaged, 1 - damaged),
-        "board_auroc": area_under(top, is_flawed, 1 - is_flawed),
+        "board_auroc": area_under(highest, is_flawed, 1 - is_flawed),
     }
 
 

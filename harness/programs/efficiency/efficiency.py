@@ -1,8 +1,12 @@
 """``tofpod efficiency RESULTS``: compares every detector of a study with the ideal observer."""
 
+from __future__ import annotations
+
 import argparse
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness.records.outputs import EFFICIENCY_PAGE, EXPERIMENT, STUDY, run_at
 from harness.runs.engines import engine_of
@@ -10,6 +14,11 @@ from harness.runs.options import add_engine_options, engine_options
 from harness.runs.shards import locked
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.program import program
+
+if TYPE_CHECKING:
+    from harness.evaluation.study.record import StudyRecord
+    from harness.experiment.schema import Experiment
+    from harness.programs.efficiency.statistics import Efficiency
 
 
 def _options(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +47,6 @@ def main(options: argparse.Namespace, command: str) -> int:
     """Run the program. Returns 0, 2 for a user's mistake, 130 after Ctrl-C."""
     from harness.evaluation.study.limit import limit_of
     from harness.evaluation.study.record import read_record
-    from harness.experiment.load import load_experiment
     from harness.programs.efficiency.ideal_trials import ideal_of_set_ups
     from harness.programs.efficiency.page import efficiency_html, efficiency_parts
     from harness.programs.efficiency.statistics import efficiency_of, warnings_of
@@ -58,52 +66,21 @@ def main(options: argparse.Namespace, command: str) -> int:
     recorded = read_record(folder)
     at_stated_values = tuple(set_up for set_up in recorded.set_ups if not set_up.drawn)
     study = replace(recorded, set_ups=at_stated_values)
-    if not (folder / EXPERIMENT.name).is_file():
-        fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
-        raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
-    experiment = load_experiment(folder / EXPERIMENT.name)
-    rate = study.false_calls_per_m2
-    if any(
-        point.config.mapping is not None or point.config.simulated.views
-        for point in experiment.points
-    ):
-        fix = "name a study of single views"
-        raise UserError(
-            f"{study.name}: is a study of maps, for which there is no ideal observer", fix=fix
-        )
-    if rate is None:
-        fix = "run the study with threshold.calibrate"
-        raise UserError(
-            f"{study.name}: its threshold was given, so there is no wanted rate of false calls",
-            fix=fix,
-        )
+    experiment = _experiment_of(folder)
+    rate = _wanted_rate(study, experiment)
     cache = folder.parents[1] / ".cache" / "renders"
     stated = experiment.at_stated_values()
     plan = plan_of(stated, cache, designs=recorded_designs(stated, study))
     detectors = {point.config.detector.name for point in experiment.points}
     with in_use(cache), locked(folder), engine_of(run_options, detectors) as engine:
         ideal = ideal_of_set_ups(plan, engine, rate)
-        if unknown := [
-            set_up.label for set_up in study.set_ups if (set_up.variant, set_up.frames) not in ideal
-        ]:
-            message = f"{folder}: {EXPERIMENT.name} lacks the set-up {unknown[0]} of {STUDY.name}"
-            raise UserError(message, fix="name an unchanged results folder, or run the study again")
+        _refuse_unknown(study, ideal, folder)
         rows = [
             efficiency_of(limit_of(set_up), ideal[set_up.variant, set_up.frames])
             for set_up in study.set_ups
         ]
-        cameras = [point.config.simulated.camera for point in experiment.points]
+        first = _first_sentences(experiment, rows, rate)
         warnings = warnings_of(rows)
-        names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
-        seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
-        first = (
-            f"The ideal observer judges a new unit of {names} by the noise of "
-            f"{rows[0].ideal.units} units, at "
-            f"{rate:g} false call{'' if rate == 1 else 's'} per m², with known size and "
-            "depth; the detectors' hits are "
-            f"on unit {seeds}. Not modelled: missing returns, non-Gaussian tails, noise "
-            "that differs within damage."
-        )
         if study.digest != experiment.digest:
             changed = (
                 "the hits come from another version of the camera or of a detector than the "
@@ -114,17 +91,66 @@ def main(options: argparse.Namespace, command: str) -> int:
             **record(command),
             "results_version": RESULTS_VERSION,
             "experiment": study.name,
+            "digest": study.digest,
+            "seed": experiment.config.seed,
         }
-        provenance |= {"digest": study.digest, "seed": experiment.config.seed}
         tables = {EFFICIENCY: EFFICIENCY.frame(rows), DAMAGES: DAMAGES.frame(damage_rows(rows))}
         write_tables(folder, tables, provenance)
-        write_text(
-            folder / EFFICIENCY_PAGE.name,
-            efficiency_html(rows, first, warnings, study.name, command),
-        )
+        page = efficiency_html(rows, first, warnings, study.name, command)
+        write_text(folder / EFFICIENCY_PAGE.name, page)
     show(efficiency_parts(rows, first, warnings))
     print(f"page: {folder / EFFICIENCY_PAGE.name}")
     return 0
+
+
+def _experiment_of(folder: Path) -> Experiment:
+    """Read the experiment that a sweep left in its folder. Raises UserError if there is none."""
+    from harness.experiment.load import load_experiment
+
+    if not (folder / EXPERIMENT.name).is_file():
+        fix = f"name the folder in which the sweep left {EXPERIMENT.name} and {STUDY.name}"
+        raise UserError(f"{folder}: has no {EXPERIMENT.name}, which says what to simulate", fix=fix)
+    return load_experiment(folder / EXPERIMENT.name)
+
+
+def _wanted_rate(study: StudyRecord, experiment: Experiment) -> float:
+    """Return the wanted false calls per square metre. Raises UserError if the study has none, or
+    is one of maps."""
+    for point in experiment.points:
+        if point.config.mapping is not None or point.config.simulated.views:
+            raise UserError(
+                f"{study.name}: is a study of maps, for which there is no ideal observer",
+                fix="name a study of single views",
+            )
+    if study.false_calls_per_m2 is None:
+        raise UserError(
+            f"{study.name}: its threshold was given, so there is no wanted rate of false calls",
+            fix="run the study with threshold.calibrate",
+        )
+    return study.false_calls_per_m2
+
+
+def _refuse_unknown(study: StudyRecord, ideal: Container[tuple[str, int]], folder: Path) -> None:
+    """Raise UserError if the study has a set-up that its experiment lacks."""
+    for set_up in study.set_ups:
+        if (set_up.variant, set_up.frames) not in ideal:
+            raise UserError(
+                f"{folder}: {EXPERIMENT.name} lacks the set-up {set_up.label} of {STUDY.name}",
+                fix="name an unchanged results folder, or run the study again",
+            )
+
+
+def _first_sentences(experiment: Experiment, rows: Sequence[Efficiency], rate: float) -> str:
+    """Say what was compared with what."""
+    cameras = [point.config.simulated.camera for point in experiment.points]
+    names = ", ".join(dict.fromkeys(camera.name for camera in cameras))
+    seeds = ", ".join(dict.fromkeys(str(camera.unit_seed) for camera in cameras))
+    calls = f"{rate:g} false call{'' if rate == 1 else 's'} per m²"
+    return (
+        f"The ideal observer judges a new unit of {names} by the noise of {rows[0].ideal.units} "
+        f"units, at {calls}, with known size and depth; the detectors' hits are on unit {seeds}. "
+        "Not modelled: missing returns, non-Gaussian tails, noise that differs within damage."
+    )
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from harness.trials import judge
 from harness.trials.board import INTACT_MARGIN_PX, LabelledCloud, far_from, outlined, pixel_areas
 from harness.trials.record import add_judgement
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Cloud, Frame, invert, transform_points
+from harness.vocabulary.geometry import MM, Cloud, Frame, invert, rays_of, transform_points
 from harness.vocabulary.seeds import digest, random_stream
 from scenes.implants import (
     BEYOND_PX,
@@ -117,7 +117,7 @@ class Scan:
     @cached_property
     def rays(self) -> np.ndarray:
         """Rays (h, w, 3) with z = 1."""
-        return np.concatenate([self.slopes, np.ones((*self.slopes.shape[:2], 1))], axis=-1)
+        return rays_of(self.slopes)
 
     @cached_property
     def places_m(self) -> np.ndarray:
@@ -351,50 +351,25 @@ def judge_scans(
     the same frames do both, and a warning says so."""
     record = TrialRecord()
     warnings = [text for scan in scans if (text := scan.left_out(family))]
-    calibrated: dict[int, int] = {}
+    calibration_runs: dict[int, int] = {}
     for count in frames:
-        groups = [
-            (scan, slice(k, k + count))
-            for scan in scans
-            for k in range(0, len(scan.frames) - count + 1, count)
-        ]
-        if not groups:
-            longest = max(len(scan.frames) for scan in scans)
-            raise UserError(
-                f"--frames {count}: no recording has that many frames", legal=f"1 to {longest}"
-            )
-        setting, judged = (groups[::2], groups[1::2]) if len(groups) > 1 else (groups, groups)
-        if len(groups) == 1:
+        groups = _groups(scans, count)
+        if len(groups.all) == 1:
             warnings.append(
                 f"{count} frames: one average sets the threshold, shows the false calls and "
                 "is damaged too"
             )
-        setting = setting[:MOST_SETTING] if judging.threshold is None else []
-        quiet = judged[:MOST_HOLE_FREE]
+        setting = groups.setting[:MOST_SETTING] if judging.threshold is None else []
         own_thresholds = [
             judging.threshold_of(scan.averaged(scan.frames[group])) for scan, group in setting
         ]
         warnings += dict.fromkeys(
             f"{count} frames: {text}" for _, doubts in own_thresholds for text in doubts
         )
-        calibrated[count] = len(own_thresholds)
+        calibration_runs[count] = len(own_thresholds)
         threshold = judging.threshold or float(np.median([value for value, _ in own_thresholds]))
-
-        for number, (scan, group) in enumerate(quiet):
-            sites = damages_placed(scan, family, camera, "hole_free", number)
-            cloud = scan.averaged(scan.frames[group])
-            labelled = scan.known(cloud, sites, damaged=False)
-            _add(record, judging, labelled, threshold, frames=count, board=number)
-        for placement_index, placement in enumerate(implanted):
-            slices = [group for scan, group in judged if scan is placement.scan]
-            slices = slices or [group for scan, group in groups if scan is placement.scan]
-            cloud = placement.cloud(slices[placement_index % len(slices)])
-            labelled = placement.scan.known(cloud, placement.target, damaged=True)
-            _add(record, judging, labelled, threshold, frames=count, board=placement.number)
-            print(
-                f"frames averaged {count}: placement {placement_index + 1} of {len(implanted)}",
-                file=sys.stderr,
-            )
+        _add_undamaged(record, judging, groups, threshold, family=family, camera=camera)
+        _add_placements(record, judging, groups, threshold, implanted)
     tables = ResultTables(
         **{
             name: pd.DataFrame(columns_of(rows, {}) if rows else {})
@@ -405,25 +380,91 @@ def judge_scans(
     )
     detector = judge.detector_of(judging.detector, judging.settings_json)
     camera_data = camera_of(unit_config(camera, scans[0].lens)[0]).to_data()
-    set_ups = []
     files = [path.as_posix() for scan in scans for path in scan.recording.files]
+    set_ups = []
     for count in frames:
-        holes = tables.holes[tables.holes["frames"] == count]
-        runs = tables.runs[tables.runs["frames"] == count]
-        set_ups.append(
-            set_up_of(
-                holes,
-                runs,
-                variant=VARIANT,
-                frames=count,
-                detector=detector.name,
-                detector_version=detector.version,
-                calibration_runs=calibrated[count],
-                targets_digest=digest([placement.target.to_data() for placement in implanted]),
-                frames_digest=digest([camera_data, count, *files]),
-            )
+        set_up = set_up_of(
+            tables.holes[tables.holes["frames"] == count],
+            tables.runs[tables.runs["frames"] == count],
+            variant=VARIANT,
+            frames=count,
+            detector=detector.name,
+            detector_version=detector.version,
+            calibration_runs=calibration_runs[count],
+            targets_digest=digest([placement.target.to_data() for placement in implanted]),
+            frames_digest=digest([camera_data, count, *files]),
         )
+        set_ups.append(set_up)
     return tables, tuple(set_ups), tuple(warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups:
+    """Groups of so many frames in a row, none of which share a frame."""
+
+    count: int
+    """Number of frames of a group."""
+    all: list[tuple[Scan, slice]]
+    """The scan of each group, and its frames."""
+    setting: list[tuple[Scan, slice]]
+    """Those that may set the threshold."""
+    judged: list[tuple[Scan, slice]]
+    """Those that are judged."""
+
+
+def _groups(scans: Sequence[Scan], count: int) -> _Groups:
+    """Return the groups of ``count`` frames. Raises UserError if no scan has as many frames."""
+    groups = [
+        (scan, slice(start, start + count))
+        for scan in scans
+        for start in range(0, len(scan.frames) - count + 1, count)
+    ]
+    if not groups:
+        longest = max(len(scan.frames) for scan in scans)
+        raise UserError(
+            f"--frames {count}: no recording has that many frames", legal=f"1 to {longest}"
+        )
+    if len(groups) == 1:
+        return _Groups(count, groups, setting=groups, judged=groups)
+    return _Groups(count, groups, setting=groups[::2], judged=groups[1::2])
+
+
+def _add_undamaged(
+    record: TrialRecord,
+    judging: Judging,
+    groups: _Groups,
+    threshold: float,
+    *,
+    family: DrawnTargetConfig,
+    camera: str,
+) -> None:
+    """Judge undamaged averages and add their rows."""
+    for number, (scan, group) in enumerate(groups.judged[:MOST_HOLE_FREE]):
+        sites = damages_placed(scan, family, camera, "hole_free", number)
+        cloud = scan.averaged(scan.frames[group])
+        labelled = scan.known(cloud, sites, damaged=False)
+        _add(record, judging, labelled, threshold, frames=groups.count, board=number)
+
+
+def _add_placements(
+    record: TrialRecord,
+    judging: Judging,
+    groups: _Groups,
+    threshold: float,
+    implanted: Sequence[Implanted],
+) -> None:
+    """Judge all placements, in turn on the groups of their scans, and add their rows."""
+    for index, placement in enumerate(implanted):
+        slices = [group for scan, group in groups.judged if scan is placement.scan]
+        # a scan with one group has perhaps only set the threshold
+        slices = slices or [group for scan, group in groups.all if scan is placement.scan]
+        cloud = placement.cloud(slices[index % len(slices)])
+        labelled = placement.scan.known(cloud, placement.target, damaged=True)
+        _add(record, judging, labelled, threshold, frames=groups.count, board=placement.number)
+        print(
+            f"frames averaged {groups.count}: placement {index + 1} of {len(implanted)}",
+            file=sys.stderr,
+        )
 
 
 def _add(

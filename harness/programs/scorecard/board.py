@@ -33,7 +33,7 @@ from harness.report.blocks import COLOURS, command_of, figure, heading, note, pa
 from harness.stills.statistics import Reading, jackknifed, mean_of, temporal_sigma_m
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.files import write_json, write_text
-from harness.vocabulary.geometry import MM, Cloud, Lens, invert, transform_points
+from harness.vocabulary.geometry import MM, Cloud, Lens, invert, rays_of, transform_points
 from harness.vocabulary.provenance import RESULTS_VERSION, record
 from harness.vocabulary.text import show
 from scenes.render.cache import cached_view
@@ -85,7 +85,7 @@ class Image:
     def rays(self) -> np.ndarray:
         """The rays (h, w, 3) of the pixels, with z = 1."""
         slopes = self.lens.region_slopes(self.lens.whole)
-        return np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+        return rays_of(slopes)
 
     @cached_property
     def plan_mm(self) -> np.ndarray:
@@ -261,46 +261,23 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
         point.config.detector.name: point.config.detector.settings for point in experiment.points
     }
     config = points[0].config
-    source = points[0].config.simulated
-    target = source.target
-    if not isinstance(target, TargetConfig) or not target.holes or config.threshold.k is None:
-        problem = (
-            f"{options.board}: declares no drilled board in front of a simulated camera, or no "
-            "threshold k"
-        )
-        legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
-        raise UserError(problem, legal=legal)
-    camera = camera_of(source.camera)
-    frames = config.capture.frames
-    remarks = []
-    rows = []
+    target = _drilled(config, options)
+    camera = camera_of(config.simulated.camera)
     image = image_of(target, camera, recording.lens if recording else None)
-    judged = {}
+    frames = config.capture.frames
+    remarks: list[str] = []
+    judged: dict[str, tuple[Readings, np.ndarray]] = {}
     if recording is not None:
-        left_out = {frame.name: frame.why for frame in average(recording, AverageConfig()).left_out}
-        remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
-        taken = [frame.z_m for frame in recording.frames() if frame.name not in left_out]
-        z_m = np.stack(taken).astype(float)
+        z_m, remarks = _captured(recording)
         frames = len(z_m)
         judged["capture"] = measured(z_m, image, target, config, detectors)
+    real: Readings = judged["capture"][0] if recording else {}
+    rows = []
     for point in points:
         label = point.variant.split(", detector=")[0]
         z_m = _simulated(point, image, frames, options)
         judged[label] = measured(z_m, image, target, config, detectors)
-        real = judged["capture"][0] if recording else {}
-        for key, (value, count) in judged[label][0].items():
-            quantity, condition, unit = key
-            rows.append(
-                Beside(
-                    where=label,
-                    quantity=quantity,
-                    at=condition,
-                    unit=unit,
-                    pixels=count,
-                    measured=real[key][0] if key in real else Reading(float("nan")),
-                    simulated=value,
-                )
-            )
+        rows += _beside(label, judged[label][0], real)
         print(f"simulated: {label}", flush=True)
     answer = "No capture is given, so there is nothing to compare with."
     if recording:
@@ -329,6 +306,46 @@ def run_board(options: argparse.Namespace, recording: Recording | None, command:
     write_json(options.out / "provenance.json", origin)
     print(f"wrote {options.out / 'capture.html'}")
     return 0
+
+
+def _drilled(config: ExperimentConfig, options: argparse.Namespace) -> TargetConfig:
+    """Return the drilled board of an experiment. Raises UserError if it declares none."""
+    target = config.simulated.target
+    if isinstance(target, TargetConfig) and target.holes and config.threshold.k is not None:
+        return target
+    problem = (
+        f"{options.board}: declares no drilled board in front of a simulated camera, or no "
+        "threshold k"
+    )
+    legal = "source.kind: simulated, source.target.name: custom with holes, threshold: {k: ...}"
+    raise UserError(problem, legal=legal)
+
+
+def _captured(recording: Recording) -> tuple[np.ndarray, list[str]]:
+    """Return the frames (n, h, w) of a capture, and which were left out."""
+    left_out = {frame.name: frame.why for frame in average(recording, AverageConfig()).left_out}
+    taken = [frame.z_m for frame in recording.frames() if frame.name not in left_out]
+    remarks = [f"{name} is left out: {why}" for name, why in left_out.items()]
+    return np.stack(taken).astype(float), remarks
+
+
+def _beside(label: str, simulated: Readings, real: Readings) -> list[Beside]:
+    """Return the rows of a set-up's readings, beside those of the capture."""
+    rows = []
+    for key, (value, count) in simulated.items():
+        quantity, condition, unit = key
+        rows.append(
+            Beside(
+                where=label,
+                quantity=quantity,
+                at=condition,
+                unit=unit,
+                pixels=count,
+                measured=real[key][0] if key in real else Reading(float("nan")),
+                simulated=value,
+            )
+        )
+    return rows
 
 
 def _simulated(point: Point, image: Image, frames: int, options: argparse.Namespace) -> np.ndarray:

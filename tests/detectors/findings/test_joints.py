@@ -71,7 +71,7 @@ def test_head_joints_are_one_feature() -> None:
     assert len(facts["places_px"]) == len(BRICKS)
 
 
-@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "points"])
+@pytest.mark.parametrize("field", ["model_depth_m", "width_m", "length_m", "points"])
 def test_a_joint_that_differs_stays_a_finding(field: str) -> None:
     detections, measurements = wall()
     usual = getattr(measurements[7], field)
@@ -222,6 +222,24 @@ def test_damage_that_touches_a_joint_is_a_finding_of_its_own() -> None:
     undamaged = without_damage(feature, [part])
     assert sorted(undamaged.members) == list(range(len(BRICKS)))
     assert undamaged.differing == ()
+
+
+@pytest.mark.parametrize("end", [-1, 1])
+def test_damage_at_the_end_of_a_joint_is_what_lies_beyond_it(end: int) -> None:
+    """It is wider than the joint, which ends within it."""
+    detections, measurements = wall()
+    row, column = BRICKS[7]
+    first = row + 7 if end > 0 else row - 14
+    rows, columns = np.mgrid[first : first + 7, column - 3 : column + 4]
+    hole = (rows * SHAPE[1] + columns).ravel()
+    joint = detections[7].pixels
+    damaged = np.union1d(joint, hole)
+    detections[7] = replace(detections[7], pixels=damaged)
+    measurements[7] = replace(measurements[7], points=len(damaged), length_m=24 * PITCH_M)
+    (feature,) = joints_of(CLOUD, EVIDENCE, detections, measurements)
+    assert feature.differing == (7,)
+    (part,) = damage_beside(CLOUD, EVIDENCE, detections, measurements, feature)
+    assert part.detection.pixels.tolist() == np.setdiff1d(hole, joint).tolist()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.stats import poisson
 
-from detectors.findings.tails import DRAWS, EXPONENTS, PRIOR, Tail, _count_reaching
+from detectors.findings.tails import DRAWS, EXPONENTS, PRIOR, Laws, Tail, _count_reaching
 
 
 def test_the_interval_of_counts_is_poissons_where_the_law_is_known() -> None:
@@ -94,3 +94,22 @@ def test_the_prior_weights_of_exponents_are_probabilities() -> None:
     assert len(PRIOR) == len(EXPONENTS)
     # averages of a camera's noise are near normal
     assert PRIOR[:2].sum() > 0.8
+
+
+def test_the_density_of_calls_is_minus_the_slope_of_their_number() -> None:
+    exponents = np.array(EXPONENTS)
+    laws = Laws(
+        floor=3.0,
+        exponents=exponents,
+        numbers=np.linspace(5.0, 50.0, len(exponents)),
+        rates=np.linspace(0.6, 1.4, len(exponents)),
+        scale=1.3,
+    )
+    scores = np.array([4.2, 5.0, 7.5])
+    step = 1e-5
+    slopes = []
+    for score in scores:
+        slopes.append((laws.expected(score - step) - laws.expected(score + step)) / (2.0 * step))
+    assert laws.densities(scores) == pytest.approx(np.transpose(slopes), rel=1e-6)
+    # at the floor, all calls lie above
+    assert laws.expected(3.0 * 1.3) == pytest.approx(laws.numbers)

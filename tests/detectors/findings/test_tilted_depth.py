@@ -8,7 +8,7 @@ import pytest
 
 from detectors import load_detector
 from detectors.surfaces.surface import along_rays
-from harness.vocabulary.geometry import Cloud, Lens, Region
+from harness.vocabulary.geometry import Cloud, Lens, Region, rays_of
 
 SHAPE = (90, 120)
 LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, -120.0, 44.5)
@@ -25,7 +25,7 @@ NOISE_M = 2e-4
 def dented_board() -> Cloud:
     """Return a plane with a flat-bottomed dent of `DEPTH_M` along its normal."""
     slopes = LENS.region_slopes(LENS.whole)
-    rays = np.concatenate([slopes, np.ones((*SHAPE, 1))], axis=-1)
+    rays = rays_of(slopes)
     opening = rays @ NORMAL
     face = rays * (DISTANCE_M / opening)[..., None]
     middle = face[SHAPE[0] // 2, SHAPE[1] // 2]

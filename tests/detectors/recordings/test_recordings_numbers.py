@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
 from detectors.recordings import open_capture
 from detectors.recordings.arrays import (
@@ -23,7 +24,13 @@ from detectors.recordings.arrays import (
     raw_layout_of,
 )
 from detectors.recordings.clouds import _grid_of
-from detectors.recordings.depth_images import _colours_of, depth_files, depth_named, png_kind
+from detectors.recordings.depth_images import (
+    _colours_of,
+    _depth_size,
+    depth_files,
+    depth_named,
+    png_kind,
+)
 from detectors.recordings.distances import (
     _weight,
     decided_unit,
@@ -898,3 +905,23 @@ def test_the_kind_of_a_png_stands_in_its_header(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is truncated"):
         png_kind(tmp_path / "9.png")
     assert [path.name for path in depth_files(tmp_path)] == ["7.png", "8.png", "9.png"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"),
+    [
+        ("L", ", grey"),
+        ("RGB", ", RGB"),
+        ("P", ", palette"),
+        ("LA", ", grey with alpha"),
+        ("RGBA", ", RGBA"),
+    ],
+)
+def test_a_picture_is_no_depth_and_the_message_says_what_it_is(
+    tmp_path: Path, mode: str, text: str
+) -> None:
+    PillowImage.new(mode, (9, 5)).save(tmp_path / "p.png")
+    with pytest.raises(
+        UserError, match=f"bits per channel{text}: a picture or a mask, not a depth image"
+    ):
+        _depth_size(tmp_path / "p.png")

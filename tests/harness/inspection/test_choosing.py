@@ -10,11 +10,13 @@ import pytest
 
 from detectors import load_detector
 from detectors.findings.tails import Tail, calls_at, threshold_at
+from detectors.findings.virtual_holes import VirtualHoles
 from detectors.interface import Detection, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
 from detectors.surfaces.background import Background, background
 from detectors.surfaces.surface import SurfaceConfig
 from harness.inspection import arguments as cli
+from harness.inspection import choosing
 from harness.inspection.choosing import Contender, _is_better, candidate_of, chosen
 from harness.testing.synthetic_clouds import plane
 from harness.vocabulary.errors import UserError
@@ -117,6 +119,39 @@ def test_the_one_that_finds_most_holes_is_chosen_and_says_so(cloud: Cloud) -> No
     )
     again = chosen([blunt, sharp], cloud, "1 expected false call")
     assert again.evidence.notes == best.evidence.notes
+
+
+@pytest.mark.parametrize(
+    ("shares", "scales"),
+    [
+        ([0.2], [1.0]),
+        ([0.8], [1.0]),
+        ([0.05, 0.5], [1.0, 2.5]),
+        ([0.95, 0.5], [1.0, 0.4]),
+        ([0.0, 0.0, 0.0], [1.0, 2.5, 6.25]),
+    ],
+)
+def test_depths_change_until_the_best_finds_some_of_the_holes(
+    cloud: Cloud, monkeypatch: pytest.MonkeyPatch, shares: list[float], scales: list[float]
+) -> None:
+    deepest_m = []
+    left = list(shares)
+
+    def found(
+        candidate: Contender, part: Cloud, holes: VirtualHoles, squares: tuple[int, ...]
+    ) -> np.ndarray:
+        deepest_m.append(holes.depths_m.max())
+        return np.full(len(holes.rows), left.pop(0))
+
+    # a single picture of holes, so that each try is one call
+    monkeypatch.setattr(choosing, "MOST_ROUNDS", 1)
+    monkeypatch.setattr(choosing, "FEWEST", 1)
+    monkeypatch.setattr(choosing, "_found", found)
+    sought = choosing._sought([seeing("thesis", 5.0, cloud)], cloud, 1.0)
+    assert left == []
+    assert np.divide(deepest_m, deepest_m[0]) == pytest.approx(scales)
+    assert sought is not None
+    assert sought.depths_mm[1] == pytest.approx(deepest_m[-1] * 1e3)
 
 
 def with_laws(contender: Contender, at_marks: int) -> Contender:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import trimesh
 
 from harness import detect
 from harness.inspection.arguments import is_mesh
-from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change
+from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change, _departure_m
 from harness.inspection.references import captures_in
-from tests.harness.inspection.test_verdict import finding
+from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support import marked_board
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
 
@@ -175,3 +176,23 @@ def test_states(
     if change_mm == 1.5 and now_mm == 2.5:
         assert change.then is not None
         assert change.then.depth_mm == pytest.approx(1.0)
+
+
+def test_a_departure_is_that_of_the_core_from_the_ring_around_it() -> None:
+    """On a plane seen from 1 m: a disc of 10 mm radius 3 mm deep, where all else is 1 mm deep."""
+    capture = judged_of()
+    x_m, y_m, _ = np.moveaxis(capture.cloud.points_m, -1, 0)
+    from_middle_m = np.hypot(x_m - 0.011, y_m - 0.003)
+    residual_m = np.where(from_middle_m < 0.010, 3e-3, 1e-3)
+    # neither the middle of the way between core and ring nor what is far away counts
+    residual_m[(from_middle_m > 0.006) & (from_middle_m < 0.0115)] = 9e-3
+    residual_m[from_middle_m > 0.021] = -9e-3
+    capture = replace(capture, evidence=replace(capture.evidence, residual_m=residual_m))
+    corners_m = np.array([[0.010, 0.0, 1.0], [-0.010, 0.0, 1.0], [0.0, 0.010, 1.0]])
+    places_m = np.concatenate([corners_m, corners_m * [-1.0, -1.0, 1.0]])
+    T = np.eye(4)
+    T[:2, 3] = [0.011, 0.003]
+    assert _departure_m(places_m, capture, T) == pytest.approx(2e-3)
+    assert _departure_m(places_m[:0], capture, T) == 0.0
+    T[0, 3] = 1.0
+    assert _departure_m(places_m, capture, T) == 0.0

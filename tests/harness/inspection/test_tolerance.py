@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from detectors import load_detector
+from detectors.findings.family import DEPTH_ERROR
 from detectors.surfaces.drawing import DrawingFile, drawing_under, read_drawing
 from harness import detect
 from harness.inspection.judging import judged
@@ -27,6 +28,7 @@ from harness.inspection.tolerance import (
     PartDecision,
     Tolerance,
     _doubt,
+    _of_volume,
     combined,
     decided,
     part_decision,
@@ -36,7 +38,7 @@ from harness.inspection.verdict import DOUBTFUL, SURE
 from harness.vocabulary.errors import UserError
 from tests.detectors.surfaces.test_drawing import casting, stood
 from tests.detectors.surfaces.test_drawing import seen as casting_seen
-from tests.harness.inspection.test_verdict import finding
+from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
 from tests.validation.tolerance_risks import decided_on
 
@@ -172,6 +174,11 @@ def test_volume_and_deviation_are_those_of_a_dent(tmp_path: Path) -> None:
     # 25 pixels of 0.3 mm each, the largest of some 260 places
     sizes = {entry.name.split(",")[0]: entry.size for entry in deviation.contributions}
     assert sizes["noise"] == pytest.approx(0.3 / 5 * 3.55 / GUARD, rel=0.15)
+    # the drawing is placed with an error that differs little over the dent
+    from_middle_m = np.linalg.norm(points_m - result.detections[0].centre_m, axis=1)
+    assert cloud.expected is not None
+    placed_mm = 1e3 * cloud.expected.registration_at(points_m[from_middle_m < 8e-3])
+    assert sizes["registration"] == pytest.approx(np.nanmean(placed_mm), rel=0.2)
     without_dent = casting_seen(path, stood((6, -8, 3)), 0.3)
     undamaged = replace(without_dent, expected=cloud.expected)
     result = judged(detector, undamaged, detector.analyse(undamaged), 6.0)
@@ -217,3 +224,24 @@ def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> No
     assert stated["decision"] == FAILS
     assert stated["reference"] == str(tmp_path / "then")
     assert stated["findings"] == tolerance["findings"]
+
+
+def test_the_uncertainty_of_a_volume_by_hand() -> None:
+    """100 pixels of 4 mm2 that are 3 mm deep, in noise of +-0.5 mm."""
+    result = judged_of(9.0)
+    (detection,) = result.detections
+    residual_m = np.where(np.arange(2400) % 2, 5e-4, -5e-4)
+    residual_m[detection.pixels] = 3e-3
+    evidence = replace(result.evidence, residual_m=residual_m.reshape(40, 60))
+    dent = finding(volume_mm3=-1200.0)
+    noise, model, outline = _of_volume(replace(result, evidence=evidence), dent, detection)
+    # the mean of the pixels and that of their surroundings
+    assert noise.size == pytest.approx(400.0 * 0.5 / 0.6745 * math.sqrt(2.0 / 100.0), rel=1e-4)
+    assert model.size == pytest.approx(DEPTH_ERROR * 1200.0)
+    # 36 of the pixels are outermost
+    assert outline.size == pytest.approx(0.5 * 36 * 4.0 * 3.0)
+    is_correlated = replace(result.cloud, noise_reach_px=5.0)
+    correlated = replace(result, evidence=evidence, cloud=is_correlated)
+    assert _of_volume(correlated, dent, detection)[0].size == pytest.approx(5.0 * noise.size)
+    nothing = replace(evidence, residual_m=np.full((40, 60), np.nan))
+    assert _of_volume(replace(result, evidence=nothing), dent, detection) == ()

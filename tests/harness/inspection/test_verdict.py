@@ -11,6 +11,7 @@ import pytest
 from detectors.interface import Detection, Evidence, Measurement, MissingReturns
 from harness.inspection import verdict
 from harness.inspection.verdict import (
+    _plan_areas_m2,
     counted_text,
     extent_of,
     flags_of,
@@ -272,6 +273,15 @@ def test_the_area_of_a_cloud_without_a_grid_is_that_of_its_plan_view() -> None:
     assert extent.judged_m2 == pytest.approx(0.08, rel=0.05)
 
 
+def test_the_area_in_plan_by_hand() -> None:
+    """Twelve points fill four squares of 3 mm2; eleven are too few to tell."""
+    y_m, x_m = np.mgrid[:3, :4] * 1e-3
+    points_m = np.stack([x_m, y_m, np.ones((3, 4))], axis=-1)
+    assert _plan_areas_m2(points_m) == pytest.approx(np.full((3, 4), 1e-6))
+    points_m[0, 0] = np.nan
+    assert np.isnan(_plan_areas_m2(points_m)).all()
+
+
 # ---- the sentence
 
 
@@ -318,6 +328,22 @@ def test_the_sentence_says_which_share_of_the_part_was_judged() -> None:
     judged = replace(judged, evidence=replace(judged.evidence, residual_m=residual_m))
     sentence = verdict_of(with_remarks(judged, 5.0), 5.0, outline).sentence
     assert sentence.startswith("One hole found on 72 cm2, 75 % of the part; ")
+
+
+@pytest.mark.parametrize(
+    ("count", "clause"),
+    [
+        (0, "; 1.0 false calls"),
+        (1, "; one place departs no more than the profile is uncertain at its steps; 1.0"),
+        (14, "; 14 places depart no more than the profile is uncertain at its steps; 1.0"),
+    ],
+)
+def test_the_sentence_says_how_many_places_steps_explain(count: int, clause: str) -> None:
+    judged = judged_of(20.0)
+    notes = {"own_null": NULL, "at_steps": count}
+    judged = replace(judged, evidence=replace(judged.evidence, notes=notes))
+    sentence = verdict_of(with_remarks(judged, 5.0), 5.0).sentence
+    assert sentence.startswith(f"One hole found on 96 cm2 of the part{clause}")
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,34 @@ def test_form_errors_are_the_shells_that_hold_the_points():
     assert fit.form_error_m(0.95) == pytest.approx(2 * 1.96 * fit.radial_m.std(), rel=0.1)
 
 
+def test_figures_of_a_sphere_by_hand():
+    fit = SphereFit(
+        stated_m=0.050,
+        centre_m=np.array([0.0, 0.0, 1.0]),
+        covariance_m2=np.eye(3),
+        radius_m=0.052,
+        radius_sigma_m=1e-3,
+        pixels=np.arange(4),
+        residual_m=np.array([1e-3, -1e-3, 3e-3, 1e-3]),
+        radial_m=np.array([-2e-3, -1e-3, 0.0, 1e-3, 4e-3]),
+        expected_px=16,
+    )
+    assert fit.seen_share == 0.25
+    assert fit.scatter_m == pytest.approx(np.sqrt(3.0) * 1e-3)
+    assert fit.size_error_m == pytest.approx(4e-3)
+    assert fit.form_error_m(1.0) == pytest.approx(6e-3)
+    assert fit.form_error_m(0.5) == pytest.approx(2e-3)
+
+
+@pytest.mark.parametrize(("size", "count"), [(1.0, 2), (1.05, 2), (1.3, 0)])
+def test_a_sphere_of_about_the_stated_size_is_found_and_its_error_is_stated(size, count):
+    """Its interval is far narrower than the error, which is no reason to leave it out."""
+    fits = find_spheres(sphere_scene(CENTRES_M, size * RADIUS_M, 2e-4), RADIUS_M)
+    assert len(fits) == count
+    for fit in fits:
+        assert fit.size_error_m == pytest.approx(2 * (size - 1) * RADIUS_M, abs=8e-4)
+
+
 def test_correlated_neighbours_share_an_error():
     rng = np.random.default_rng(0)
     pixels = np.arange(60 * 60)

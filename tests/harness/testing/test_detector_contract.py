@@ -19,7 +19,7 @@ from harness.testing import contract as checks
 from harness.testing.synthetic_clouds import cylinder, plane, synthetic_clouds, with_gaps
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Cloud
+from harness.vocabulary.geometry import Cloud, rays_of
 
 CLOUD = with_gaps(plane(seed=3), seed=4)
 
@@ -450,10 +450,7 @@ def test_a_turned_cloud_is_what_the_turned_lens_sees() -> None:
         CLOUD.lens, fy=480.0, cx=50.0, distortion=(0.1, -0.02, 1e-3, -2e-3, 0.0, 0.0, 0.0, 0.0)
     )
     slopes = skewed.region_slopes(skewed.whole)
-    points = (
-        np.concatenate([slopes, np.ones((*CLOUD.valid.shape, 1))], axis=-1)
-        * CLOUD.points_m[..., 2:]
-    )
+    points = rays_of(slopes) * CLOUD.points_m[..., 2:]
     turned = turned_once(replace(CLOUD, lens=skewed, points_m=points))
     assert turned.valid.shape == CLOUD.valid.shape[::-1] == turned.region.shape
     expected = turned.lens.region_slopes(turned.region)

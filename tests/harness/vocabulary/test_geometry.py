@@ -14,6 +14,7 @@ from harness.vocabulary.geometry import (
     OtherLens,
     Region,
     invert,
+    rays_of,
     rotate_vectors,
     rotation_xyz_deg,
     transform_points,
@@ -77,9 +78,8 @@ def test_slopes_and_pixels_are_inverse(lens: Lens) -> None:
     u = np.array([[10.0, 320.5, 600.0], [100.0, 200.0, 500.0]])
     v = np.array([[300.0, 240.0, 20.0], [400.0, 100.25, 350.0]])
     slopes = lens.slopes(u, v)
-    rays = np.concatenate([slopes, np.ones((2, 3, 1))], axis=-1)
     z_m = np.array([0.5, 1.0, 3.0])
-    points = rays * z_m[:, None]
+    points = rays_of(slopes) * z_m[:, None]
     assert lens.project(points) == pytest.approx(np.stack([u, v], axis=-1), abs=1e-4)
     unmoved = np.zeros(3)
     by_cv, _ = cv2.projectPoints(
@@ -89,7 +89,9 @@ def test_slopes_and_pixels_are_inverse(lens: Lens) -> None:
 
 
 def test_slopes_of_a_plain_lens_by_hand() -> None:
-    assert PLAIN.slopes(np.array(370.0), np.array(200.0)).tolist() == [0.1, -0.1]
+    slopes = PLAIN.slopes(np.array(370.0), np.array(200.0))
+    assert slopes.tolist() == [0.1, -0.1]
+    assert rays_of(slopes).tolist() == [0.1, -0.1, 1.0]
     assert PLAIN.matrix.tolist() == [[500.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]]
     region = Region(238, 242, 319, 324)
     slopes = PLAIN.region_slopes(region)

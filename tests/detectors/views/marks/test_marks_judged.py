@@ -18,8 +18,10 @@ from detectors.views.marks.blobs import (
     region_covariance_px2,
 )
 from detectors.views.marks.find import (
+    CORNER_PX,
     Patch,
     Spot,
+    _coded_mark,
     _mark,
     _marks,
     fit_patch,
@@ -442,3 +444,18 @@ def test_the_range_error_is_the_largest_of_three_and_shared_by_25_pixels() -> No
     parallel = replace(cloud, projection="parallel")
     by_z = patch.range_covariance_m2(centre, parallel, pixels)
     np.testing.assert_allclose(by_z, np.diag([0.0, 0.0, 4e-8 * 0.25]), atol=1e-20)
+
+
+def test_a_tag_is_as_certain_as_the_mean_of_its_four_corners() -> None:
+    """On a plane at 0.7 m, 500 pixels of focal length: 1.4 mm a pixel."""
+    cloud = pictured(np.zeros((LENS.height, LENS.width, 3), np.uint8))
+    cloud = replace(cloud, variance_m2=np.full(cloud.valid.shape, 1e-12))
+    corners = np.array([[60.0, 50.0], [100.0, 50.0], [100.0, 90.0], [60.0, 90.0]])
+    mark = _coded_mark(cloud, cloud.valid, 7, corners, False)
+    assert mark is not None
+    assert mark.centre_m == pytest.approx([(80 - 99.5) * 1.4e-3, (70 - 79.5) * 1.4e-3, 0.7])
+    assert mark.area_m2 == pytest.approx((40 * 1.4e-3) ** 2)
+    across_m2 = (1.4e-3 * CORNER_PX) ** 2 / 4
+    assert np.diag(mark.covariance_m2)[:2] == pytest.approx([across_m2, across_m2], rel=1e-3)
+    assert abs(mark.covariance_m2[0, 1]) < 1e-3 * across_m2
+    assert (mark.code, mark.doubt) == (7, "")

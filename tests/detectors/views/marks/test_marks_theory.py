@@ -164,6 +164,13 @@ def test_as_many_of_the_targets_own_pixels_pass_as_stated(tail, factor):
     assert passed < factor * FALSE_RATE
 
 
+def test_shares_of_colours_and_their_rounding_by_hand():
+    """Half a count is added to each channel; a count is uniform over a step of 1."""
+    shares, variance = chromaticity(np.array([[0, 0, 0], [10, 20, 30]], np.uint8))
+    assert shares == pytest.approx(np.array([[1 / 3, 1 / 3], [10.5 / 61.5, 30.5 / 61.5]]))
+    assert variance == pytest.approx([1 / 12 / 1.5**2, 1 / 12 / 61.5**2])
+
+
 def test_a_quarter_of_the_target_may_be_marked():
     rng = random_stream(5, "many marks")
     rgb, positions = wood(rng, 3.0 * rng.standard_normal((20_000, 3)), 20_000)

@@ -251,3 +251,15 @@ def test_points_all_over_a_flat_disc_hold_no_turn():
         pitch_m=0.004,
     )
     assert np.isnan(covariance).all() or np.sqrt(covariance[2, 2]) > np.deg2rad(2)
+
+
+def test_the_last_step_is_the_distance_that_it_moves_the_points() -> None:
+    """The first step starts from equal centroids."""
+    fixed = cloud(300)
+    moving = transform_points(transform((2, -3, 5), (0.01, 0.02, -0.01)), cloud(280, seed=1))
+    drift = coherent_point_drift(fixed, moving, CpdRegistration(max_iterations=1))
+    before = moving - moving.mean(axis=0) + fixed.mean(axis=0)
+    after = transform_points(drift.T_fixed_moving, moving)
+    assert drift.iterations == 1
+    moved_m = np.sqrt(((after - before) ** 2).sum(axis=1).mean())
+    assert drift.step_m == pytest.approx(moved_m, rel=1e-9)

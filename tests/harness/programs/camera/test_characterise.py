@@ -13,7 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from harness.programs.camera import characterise
-from harness.vocabulary.geometry import MM, Lens
+from harness.vocabulary.geometry import MM, Lens, rays_of
 from scenes.closed_form import Plane, image_view
 from scenes.sensor.camera import load_camera, read_camera
 from scenes.sensor.common.config import CameraConfig, EffectsConfig
@@ -113,7 +113,7 @@ def wall(
     slopes = camera.nominal_lens.region_slopes(camera.nominal_lens.whole)
     plane = Plane(distance_m, slope)
     z_m = plane.z_along_m(slopes)
-    rays = np.concatenate([slopes, np.ones((*z_m.shape, 1))], axis=-1)
+    rays = rays_of(slopes)
     range_m = z_m * np.linalg.norm(rays, axis=-1)
     cosine = -(rays @ plane.normal) / np.linalg.norm(rays, axis=-1)
     albedo = np.linspace(*albedos, z_m.shape[0])[:, None]

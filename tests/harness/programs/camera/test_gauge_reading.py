@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from harness.programs.camera import characterise
+from harness.programs.camera import characterise, gauge_report
 from harness.programs.camera.gauge_report import GaugeReading, read_recording
 from harness.vocabulary.geometry import MM
 from scenes.sensor.camera import read_camera
@@ -33,7 +34,9 @@ WRONG = {
     "name",
     ["all", *(pytest.param(name, marks=pytest.mark.slow) for name in ("scale", "bias", "blur"))],
 )
-def test_a_wrong_camera_is_recovered_within_its_intervals(tmp_path: Path, name: str):
+def test_a_wrong_camera_is_recovered_within_its_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+):
     wrong = WRONG[name]
     seen = reading(recorded(tmp_path, **wrong))
     scale = seen.fit.interval(0)
@@ -47,6 +50,14 @@ def test_a_wrong_camera_is_recovered_within_its_intervals(tmp_path: Path, name: 
         assert seen.blur.blur_px == pytest.approx(wrong["blur_px"], abs=0.05)
     assert len(seen.spheres) == 6
     assert seen.fit.T_camera_gauge == pytest.approx(pose(), abs=2e-3)
+    # a camera whose blur is unknown is expected to see sharply
+    unknown = (seen.fit, None, seen.sharp_m)
+    monkeypatch.setattr(gauge_report, "range_and_blur", lambda *_: unknown)
+    monkeypatch.setattr(gauge_report, "_of_surfaces", lambda *_: ())
+    one_frame = SimpleNamespace(n_frames=1)
+    sharp = gauge_report.measured("sharp", one_frame, seen.image, seen.gauge, pose())
+    assert np.nanmax(np.abs(seen.seen_m - seen.sharp_m)) > 1 * MM
+    np.testing.assert_array_equal(sharp.seen_m, seen.sharp_m)
 
 
 @pytest.mark.slow  # characterises and simulates the whole capture

@@ -25,7 +25,14 @@ from harness.programs.inspections.gauge_page import (
     template_pdf,
     tiles_of,
 )
-from harness.vocabulary.geometry import MM, Lens, invert, rotation_xyz_deg, transform_points
+from harness.vocabulary.geometry import (
+    MM,
+    Lens,
+    invert,
+    rays_of,
+    rotation_xyz_deg,
+    transform_points,
+)
 from scenes.optics import RenderConfig
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import camera_of
@@ -146,7 +153,7 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(6.0, -9.0, 3.0)
     T[:3, 3] = 0.01, -0.005, 0.42
     slopes = LENS.region_slopes(LENS.whole)
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     normal = T[:3, 2]
     centre = T[:3, 3]
     z_m = (centre @ normal) / (rays @ normal)
@@ -249,7 +256,7 @@ def seen_by(
     (frame,) = unit.capture(1, seed, "gauge").frames()
     T = target.pose.T_camera_board
     slopes = unit.view.slopes[unit.cut]
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     on_board = rays * ((T[:3, 3] @ T[:3, 2]) / (rays @ T[:3, 2]))[..., None]
     place_mm = transform_points(invert(T), on_board)[..., :2] / MM
     window = camera.nominal_lens.whole

@@ -23,7 +23,7 @@ from harness.programs.scorecard.board import (
 from harness.programs.scorecard.figures import Beside
 from harness.stills.statistics import Reading
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import MM, Lens
+from harness.vocabulary.geometry import MM, Lens, rays_of
 from scenes.sensor.camera import load_camera
 
 LENS = Lens(120, 100, 1000.0, 1000.0, 60.0, 50.0)
@@ -76,7 +76,7 @@ def test_resampled_frames_are_those_of_the_other_image() -> None:
 
     region = camera.nominal_lens.whole
     slopes = camera.nominal_lens.region_slopes(region)
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    rays = rays_of(slopes)
     z_m = board_z_m(T_depth_board, rays)
     frames = image.resampled(np.stack([z_m, z_m + 0.01]), camera)
     expected = board_z_m(image.T_image_board, image.rays)

@@ -13,7 +13,7 @@ from scipy.interpolate import griddata
 
 from harness.experiment.load import load_experiment
 from harness.programs.scorecard.validate import main
-from harness.vocabulary.geometry import Lens
+from harness.vocabulary.geometry import Lens, rays_of
 from scenes.render.cache import cached_view
 from scenes.sensor.camera import camera_of
 from scenes.sensor.source import SimulatedUnit
@@ -49,10 +49,7 @@ def aligned(z_m: np.ndarray, camera, T_colour_depth: np.ndarray) -> np.ndarray:
     """A depth image as it is seen by the colour camera: its points moved and interpolated in the
     other image."""
     slopes = camera.nominal_lens.region_slopes(camera.nominal_lens.whole)
-    points = (
-        np.concatenate([slopes, np.ones((*z_m.shape, 1))], axis=-1)[np.isfinite(z_m)]
-        * z_m[np.isfinite(z_m), None]
-    )
+    points = rays_of(slopes)[np.isfinite(z_m)] * z_m[np.isfinite(z_m), None]
     moved = points @ T_colour_depth[:3, :3].T + T_colour_depth[:3, 3]
     v, u = np.mgrid[: COLOUR.height, : COLOUR.width]
     return np.nan_to_num(griddata(COLOUR.project(moved), moved[:, 2], (u, v)))
