@@ -20,6 +20,7 @@ HIGH = 3
 ON_EDGE = 1e-12
 # a flat box is entered where it is left, but for rounding
 FLAT = 1.0 + 4e-16
+WIDER = 1.0 + 1e-12  # of the square of a distance that was computed in another way
 FINITE = np.finfo(float).max  # a box at an infinite distance is not entered
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
@@ -51,11 +52,11 @@ def tree_of(corners: np.ndarray) -> TriangleTree:
     highs[: len(starts)] = np.maximum.reduceat(ordered.max(axis=1), starts)
     levels = [np.empty((0, 2 * HIGH, CHILDREN))]
     while len(lows) > 1:
-        lows = lows.reshape(-1, CHILDREN, 3)
-        highs = highs.reshape(-1, CHILDREN, 3)
-        levels.append(np.concatenate([lows, highs], axis=2).swapaxes(1, 2))
-        lows = lows.min(axis=1)
-        highs = highs.max(axis=1)
+        child_lows = lows.reshape(-1, CHILDREN, 3)
+        child_highs = highs.reshape(-1, CHILDREN, 3)
+        levels.append(np.concatenate([child_lows, child_highs], axis=2).swapaxes(1, 2))
+        lows = child_lows.min(axis=1)
+        highs = child_highs.max(axis=1)
     return TriangleTree(ordered, order, np.ascontiguousarray(np.concatenate(levels[::-1])))
 
 
@@ -86,10 +87,16 @@ def first_hits(
     return _first_hits(*tree, starts, along)
 
 
-def closest_places(tree: TriangleTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_places(
+    tree: TriangleTree, points: np.ndarray, known: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the number (n,) of the triangle closest to each point (n, 3), and the place (n, 3) on
-    it. At the same distance, the first in the list counts. The points must be finite."""
-    return _closest_places(*tree, np.ascontiguousarray(points, float))
+    it. At the same distance, the first in the list counts. The points must be finite.
+
+    ``known`` (n, 3): any places on the triangles; those close to the points make it quicker."""
+    if known is None:
+        known = np.empty((0, 3))
+    return _closest_places(*tree, np.ascontiguousarray(points, float), known)
 
 
 # Compiled code reads places as triples of numbers: a row of an array would be an object of its own,
@@ -272,6 +279,7 @@ def _closest_places(
     numbers: np.ndarray,
     boxes: np.ndarray,
     points: np.ndarray,
+    known: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     closest = np.full(len(points), -1, np.int64)
     feet = np.zeros((len(points), 3))
@@ -280,40 +288,69 @@ def _closest_places(
     squares = np.empty(CHILDREN)
     for i in range(len(points)):
         point = _row(points, i)
-        nearest = np.inf
-        if i > 0:
-            # the place closest to the point before it bounds the search, but may not be the first
-            nearest = (1.0 + 1e-12) * _square_off(_row(feet, i - 1), point)
-        waiting[0] = 0
-        waits_at[0] = 0.0
-        size = 1
-        while size > 0:
-            size -= 1
-            node = waiting[size]
-            if waits_at[size] > nearest:
-                continue
-            if node >= len(boxes):
-                begin = (node - len(boxes)) * LEAF
-                for j in range(begin, min(begin + LEAF, len(corners))):
-                    place = _closest(corners, j, point)
-                    square = _square_off(place, point)
-                    is_first = square == nearest and numbers[j] < closest[i]
-                    if square < nearest or is_first:
-                        nearest = square
-                        closest[i] = numbers[j]
-                        feet[i, 0] = place[0]
-                        feet[i, 1] = place[1]
-                        feet[i, 2] = place[2]
-                continue
-            for child in range(CHILDREN):
-                squares[child] = 0.0
-                for axis in range(3):
-                    below = boxes[node, axis, child] - point[axis]
-                    above = point[axis] - boxes[node, HIGH + axis, child]
-                    off = max(below, above, 0.0)
-                    squares[child] += off * off
-            size = _wait(waiting, waits_at, size, node, squares, min(nearest, FINITE))
+        farthest = np.inf
+        if len(known) > 0:
+            farthest = WIDER * _square_off(_row(known, i), point)
+        elif i > 0:  # the place closest to the point before it bounds the search
+            farthest = WIDER * _square_off(_row(feet, i - 1), point)
+        number, place = _closest_within(
+            corners, numbers, boxes, point, farthest, waiting, waits_at, squares
+        )
+        if number < 0:  # by rounding, if the known place is the point itself
+            number, place = _closest_within(
+                corners, numbers, boxes, point, np.inf, waiting, waits_at, squares
+            )
+        closest[i] = number
+        feet[i, 0] = place[0]
+        feet[i, 1] = place[1]
+        feet[i, 2] = place[2]
     return closest, feet
+
+
+@numba.njit(**PLAIN)
+def _closest_within(
+    corners: np.ndarray,
+    numbers: np.ndarray,
+    boxes: np.ndarray,
+    point: Vector,
+    farthest: float,
+    waiting: np.ndarray,
+    waits_at: np.ndarray,
+    squares: np.ndarray,
+) -> tuple[int, Vector]:
+    """Return the number of the triangle closest to a point, and the place on it; -1 if the square
+    of every distance is larger than ``farthest``. The last three arrays are for its own use."""
+    closest = -1
+    foot = (0.0, 0.0, 0.0)
+    nearest = farthest
+    waiting[0] = 0
+    waits_at[0] = 0.0
+    size = 1
+    while size > 0:
+        size -= 1
+        node = waiting[size]
+        if waits_at[size] > nearest:
+            continue
+        if node >= len(boxes):
+            begin = (node - len(boxes)) * LEAF
+            for j in range(begin, min(begin + LEAF, len(corners))):
+                place = _closest(corners, j, point)
+                square = _square_off(place, point)
+                is_first = square == nearest and (closest < 0 or numbers[j] < closest)
+                if square < nearest or is_first:
+                    nearest = square
+                    closest = numbers[j]
+                    foot = place
+            continue
+        for child in range(CHILDREN):
+            squares[child] = 0.0
+            for axis in range(3):
+                below = boxes[node, axis, child] - point[axis]
+                above = point[axis] - boxes[node, HIGH + axis, child]
+                off = max(below, above, 0.0)
+                squares[child] += off * off
+        size = _wait(waiting, waits_at, size, node, squares, min(nearest, FINITE))
+    return closest, foot
 
 
 @numba.njit(inline="always", **PLAIN)
