@@ -189,10 +189,11 @@ def fitted(
     T = T_start
     pitch_m = spacing(points)
     information = np.zeros((6, 6))
+    feet = None
     for step in range(3 * STEPS if known else 0, 4 * STEPS):
         by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)
-        triangle, feet = closest_places(triangles.tree, moved)
+        triangle, feet = closest_places(triangles.tree, moved, feet)
         offsets = moved - feet
         towards = triangles.normals[triangle]
         if by_planes:
@@ -295,17 +296,17 @@ def expected(
 
     def registration_at(queries: np.ndarray) -> np.ndarray:
         rays = rays_of(queries)
-        z, _ = met(triangles, pose.T_part_camera, rays, central)
         values, vectors = np.linalg.eigh(pose.covariance)
-        variances_m2 = np.zeros(len(z))
-        for motion in (np.sqrt(np.maximum(values, 0.0)) * vectors).T:
-            # beside an edge only one of the two directions may meet the part
-            changes_m = []
-            for sign in (1.0, -1.0):
-                T = moved_by(sign * motion, pose.middle_m) @ pose.T_part_camera
-                changes_m.append(np.abs(met(triangles, T, rays, central)[0] - z))
-            variances_m2 += np.nan_to_num(np.fmax(changes_m[0], changes_m[1])) ** 2
-        return np.where(np.isfinite(z), np.sqrt(variances_m2), np.nan)
+        motions = (np.sqrt(np.maximum(values, 0.0)) * vectors).T
+        poses = [pose.T_part_camera]
+        for motion in (*motions, *-motions):
+            poses.append(moved_by(motion, pose.middle_m) @ pose.T_part_camera)
+        z_m, _ = met_from(poses, triangles, rays, central)
+        changes_m = np.abs(z_m[1:] - z_m[0])
+        # beside an edge only one of the two directions may meet the part
+        of_motions_m = np.nan_to_num(np.fmax(changes_m[:6], changes_m[6:]))
+        variances_m2 = (of_motions_m**2).sum(axis=0)
+        return np.where(np.isfinite(z_m[0]), np.sqrt(variances_m2), np.nan)
 
     return ExpectedSurface(text, z_at, spread_at, registration_at, facts)
 
@@ -352,17 +353,12 @@ def refined(
     # by the outline, the start is known to a pixel
     start = known or KnownPose(T, np.diag(steps**2), middle)
     for _ in range(REFINEMENTS):
-        z, variances_m2 = met(triangles, T, rays, central)
-        off = points[:, 2] - z
-        slopes = np.empty((len(points), 6))
-        for axis, step in enumerate(steps):
-            ends = []
-            for sign in (1.0, -1.0):
-                motion = np.zeros(6)
-                motion[axis] = sign * step
-                moved, _ = met(triangles, moved_by(motion, middle) @ T, rays, central)
-                ends.append(moved)
-            slopes[:, axis] = (ends[0] - ends[1]) / (2.0 * step)
+        poses = [T]
+        poses += [moved_by(motion, middle) @ T for motion in np.diag(steps)]
+        poses += [moved_by(-motion, middle) @ T for motion in np.diag(steps)]
+        z, variances_m2 = met_from(poses, triangles, rays, central)
+        off = points[:, 2] - z[0]
+        slopes = (z[1:7] - z[7:]).T / (2.0 * steps)
         is_met = np.isfinite(off) & np.isfinite(slopes).all(axis=1)
         off = off[is_met]
         slopes = slopes[is_met]
@@ -413,24 +409,43 @@ def met(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return z (n,) where rays meet the triangles, and the variance (n,) there: from the lens
     through (n, 2) at z = 1 (``central``), or along z at (n, 2). NaN where they meet none."""
+    z, variances_m2 = met_from([T_part_camera], triangles, rays, central)
+    return z[0], variances_m2
+
+
+def met_from(
+    poses: Sequence[np.ndarray], triangles: Triangles, rays: np.ndarray, central: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (k, n) as `met` does from each of several ``poses`` (4, 4), and the variance (n,)
+    from the first.
+
+    The poses are alike: rays through one place are traced one after the other, and find the
+    triangles that they pass in the processor's cache."""
     if central:
         along = np.column_stack([rays, np.full(len(rays), 1.0)])
         starts = np.zeros(along.shape)
     else:
         starts = np.column_stack([rays, np.full(len(rays), -FAR_M)])
         along = np.eye(3)[[2] * len(rays)]
-    origin = transform_points(T_part_camera, starts)
-    ray = rotate_vectors(T_part_camera, along)
+    by_place = (len(rays), len(poses), 3)
+    origin = np.empty(by_place)
+    ray = np.empty(by_place)
+    for number, T_part_camera in enumerate(poses):
+        origin[:, number] = transform_points(T_part_camera, starts)
+        ray[:, number] = rotate_vectors(T_part_camera, along)
+    origin = origin.reshape(-1, 3)
+    ray = ray.reshape(-1, 3)
     triangle, shares = first_hits(triangles.tree, origin, ray)
     is_hit = triangle >= 0
-    number = np.where(is_hit, triangle, 0)
+    number_of = np.where(is_hit, triangle, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        normals = triangles.normals[number]
-        reach = np.einsum("ni,ni->n", triangles.corners_m[number, 0] - origin, normals)
+        normals = triangles.normals[number_of]
+        reach = np.einsum("ni,ni->n", triangles.corners_m[number_of, 0] - origin, normals)
         reach /= np.einsum("ni,ni->n", ray, normals)
-    variances_m2 = (shares * triangles.variances_m2[number]).sum(axis=1)
-    z = np.where(is_hit, starts[:, 2] + reach, np.nan)
-    return z, np.where(is_hit, variances_m2, np.nan)
+    z = np.where(is_hit, np.repeat(starts[:, 2], len(poses)) + reach, np.nan)
+    first = slice(None, None, len(poses))
+    variances_m2 = (shares[first] * triangles.variances_m2[number_of[first]]).sum(axis=1)
+    return z.reshape(by_place[:2]).T, np.where(is_hit[first], variances_m2, np.nan)
 
 
 def another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndarray) -> str:

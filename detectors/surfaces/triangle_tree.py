@@ -1,7 +1,8 @@
 """A tree of boxes over triangles: the first triangle that a ray meets, and the closest point.
 
-The triangles are sorted along a Morton curve of their middles (Lauterbach et al. 2009), two to a
-leaf; node i of a complete binary tree has the children 2 i and 2 i + 1, and the root is node 1."""
+Middles of triangles are halved across the part's longest side, halves again, and so on; each
+second cut makes four nodes, whose boxes are compared at once: half of the time of a binary tree
+along a Morton curve. The root is node 0, and node i has the children 4 i + 1 to 4 i + 4."""
 
 from __future__ import annotations
 
@@ -11,57 +12,68 @@ import numba
 import numpy as np
 
 LEAF = 2  # triangles of a leaf
-CURVE_BITS = 20  # of a triangle's place on the curve, along one axis
-MOST_WAITING = 64  # nodes that wait while one is visited: one for each level
+CHILDREN = 4
+MOST_WAITING = 64  # nodes that wait while one is visited: three for each level
+# rows of boxes: the lowest x, y and z, then the highest
+HIGH = 3
 # a ray that passes between two triangles by rounding meets both; a share of a triangle's side
 ON_EDGE = 1e-12
+# a flat box is entered where it is left, but for rounding
+FLAT = 1.0 + 4e-16
+WIDER = 1.0 + 1e-12  # of the square of a distance that was computed in another way
+FINITE = np.finfo(float).max  # a box at an infinite distance is not entered
 PLAIN: dict[str, Any] = {"cache": True, "nogil": True}  # options of compiled functions
 
 
 class TriangleTree(NamedTuple):
     """Triangles and the boxes around them."""
 
-    # (m, 3, 3): the corners of each triangle, in the order of the curve
+    # (m, 3, 3): the corners of each triangle, leaf by leaf
     corners: np.ndarray
     # (m,): the number of each of them in the list that the tree is made of
     numbers: np.ndarray
-    # (2 leaves, 2, 3): the lowest and the highest corner of each node's box, side by side;
-    # infinite and minus infinite if it holds no triangle
+    # (nodes above the leaves, 6, 4): the boxes of each one's children; infinite and minus infinite
+    # around no triangle
     boxes: np.ndarray
 
 
 def tree_of(corners: np.ndarray) -> TriangleTree:
     """Return the tree of triangles (m, 3, 3), which must be finite and at least one."""
-    order = np.argsort(_along_curve(corners.mean(axis=1)), kind="stable")
-    ordered = np.ascontiguousarray(corners[order], dtype=np.float64)
+    count = len(corners)
     leaves = 1
-    while leaves * LEAF < len(ordered):
-        leaves *= 2
-    lows = np.full((2 * leaves, 3), np.inf)
-    highs = np.full((2 * leaves, 3), -np.inf)
-    starts = np.arange(0, len(ordered), LEAF)
-    filled = slice(leaves, leaves + len(starts))
-    lows[filled] = np.minimum.reduceat(ordered.min(axis=1), starts)
-    highs[filled] = np.maximum.reduceat(ordered.max(axis=1), starts)
-    first = leaves
-    while first > 1:
-        pairs = slice(first, 2 * first)
-        first //= 2
-        lows[first : 2 * first] = lows[pairs].reshape(-1, 2, 3).min(axis=1)
-        highs[first : 2 * first] = highs[pairs].reshape(-1, 2, 3).max(axis=1)
-    return TriangleTree(ordered, order, np.stack([lows, highs], axis=1))
+    while leaves * LEAF < count:
+        leaves *= CHILDREN
+    order = _leaf_by_leaf(corners.mean(axis=1), leaves)
+    ordered = np.ascontiguousarray(corners[order], dtype=np.float64)
+    lows = np.full((leaves, 3), np.inf)
+    highs = np.full((leaves, 3), -np.inf)
+    starts = np.arange(0, count, LEAF)
+    lows[: len(starts)] = np.minimum.reduceat(ordered.min(axis=1), starts)
+    highs[: len(starts)] = np.maximum.reduceat(ordered.max(axis=1), starts)
+    levels = [np.empty((0, 2 * HIGH, CHILDREN))]
+    while len(lows) > 1:
+        child_lows = lows.reshape(-1, CHILDREN, 3)
+        child_highs = highs.reshape(-1, CHILDREN, 3)
+        levels.append(np.concatenate([child_lows, child_highs], axis=2).swapaxes(1, 2))
+        lows = child_lows.min(axis=1)
+        highs = child_highs.max(axis=1)
+    return TriangleTree(ordered, order, np.ascontiguousarray(np.concatenate(levels[::-1])))
 
 
-def _along_curve(places: np.ndarray) -> np.ndarray:
-    """Return the number of each place (n, 3) on a Morton curve: the bits of its cell, by turns."""
-    low = places.min(axis=0)
-    side = max(float((places.max(axis=0) - low).max()), np.finfo(float).tiny)
-    cells = ((places - low) / side * (2**CURVE_BITS - 1)).astype(np.int64)
-    along = np.zeros(len(places), np.int64)
-    for bit in range(CURVE_BITS):
-        for axis in range(3):
-            along |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return along
+def _leaf_by_leaf(middles: np.ndarray, leaves: int) -> np.ndarray:
+    """Return the numbers of triangles with these middles (m, 3) in the order of their leaves, of
+    which all but the last are full."""
+    count = len(middles)
+    padded = np.concatenate([middles, np.full((leaves * LEAF - count, 3), np.inf)])
+    order = np.arange(len(padded))[None]
+    sides_m = np.ptp(middles, axis=0)
+    while order.shape[1] > LEAF:
+        axis = int(sides_m.argmax())
+        sides_m[axis] /= 2
+        half = order.shape[1] // 2
+        lower_first = np.argpartition(padded[order, axis], half - 1, axis=1)
+        order = np.take_along_axis(order, lower_first, axis=1).reshape(-1, half)
+    return order.ravel()[:count]
 
 
 def first_hits(
@@ -75,10 +87,16 @@ def first_hits(
     return _first_hits(*tree, starts, along)
 
 
-def closest_places(tree: TriangleTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closest_places(
+    tree: TriangleTree, points: np.ndarray, known: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the number (n,) of the triangle closest to each point (n, 3), and the place (n, 3) on
-    it. At the same distance, the first in the list counts. The points must be finite."""
-    return _closest_places(*tree, np.ascontiguousarray(points, float))
+    it. At the same distance, the first in the list counts. The points must be finite.
+
+    ``known`` (n, 3): any places on the triangles; those close to the points make it quicker."""
+    if known is None:
+        known = np.empty((0, 3))
+    return _closest_places(*tree, np.ascontiguousarray(points, float), known)
 
 
 # Compiled code reads places as triples of numbers: a row of an array would be an object of its own,
@@ -96,8 +114,9 @@ def _first_hits(
 ) -> tuple[np.ndarray, np.ndarray]:
     first = np.full(len(origins), -1, np.int64)
     shares = np.zeros((len(origins), 3))
-    leaves = len(boxes) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
+    waits_at = np.empty(MOST_WAITING)
+    entries = np.empty(CHILDREN)
     for i in range(len(origins)):
         origin = _row(origins, i)
         direction = _row(directions, i)
@@ -105,14 +124,18 @@ def _first_hits(
         if np.isnan(_dot(origin, direction)):
             continue
         reciprocal = (_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2]))
+        is_oblique = reciprocal[0] != 0.0 and reciprocal[1] != 0.0 and reciprocal[2] != 0.0
         nearest = np.inf
-        waiting[0] = 1
-        size = 1 if _entry(boxes, 1, origin, reciprocal) < np.inf else 0
+        waiting[0] = 0
+        waits_at[0] = 0.0
+        size = 1
         while size > 0:
             size -= 1
             node = waiting[size]
-            if node >= leaves:
-                begin = (node - leaves) * LEAF
+            if waits_at[size] > nearest:
+                continue
+            if node >= len(boxes):
+                begin = (node - len(boxes)) * LEAF
                 for j in range(begin, min(begin + LEAF, len(corners))):
                     distance, u, v = _met(corners, j, origin, direction)
                     is_first = distance == nearest and numbers[j] < first[i]
@@ -123,19 +146,12 @@ def _first_hits(
                         shares[i, 1] = u
                         shares[i, 2] = v
                 continue
-            near_node = 2 * node
-            far = near_node + 1
-            near_entry = _entry(boxes, near_node, origin, reciprocal)
-            far_entry = _entry(boxes, far, origin, reciprocal)
-            if far_entry < near_entry:
-                near_node, far = far, near_node
-                near_entry, far_entry = far_entry, near_entry
-            if far_entry < np.inf and far_entry <= nearest:
-                waiting[size] = far
-                size += 1
-            if near_entry < np.inf and near_entry <= nearest:
-                waiting[size] = near_node
-                size += 1
+            if is_oblique:
+                _enter(boxes, node, origin, reciprocal, entries)
+            else:
+                for child in range(CHILDREN):
+                    entries[child] = _entry(boxes, node, child, origin, reciprocal)
+            size = _wait(waiting, waits_at, size, node, entries, min(nearest, FINITE))
     return first, shares
 
 
@@ -147,8 +163,34 @@ def _row(places: np.ndarray, i: int) -> Vector:
 
 @numba.njit(inline="always", **PLAIN)
 def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
-    """Return a corner of one of triangles (m, 3, 3) or boxes (m, 2, 3)."""
+    """Return a corner of one of triangles (m, 3, 3)."""
     return corners[j, number, 0], corners[j, number, 1], corners[j, number, 2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _wait(
+    waiting: np.ndarray,
+    waits_at: np.ndarray,
+    size: int,
+    node: int,
+    distances: np.ndarray,
+    farthest: float,
+) -> int:
+    """Let the children of a node wait that are no farther than ``farthest``, the nearest at the
+    end. Return how many nodes then wait."""
+    end = size
+    for child in range(CHILDREN):
+        distance = distances[child]
+        if distance <= farthest:
+            place = end
+            while place > size and waits_at[place - 1] < distance:
+                waits_at[place] = waits_at[place - 1]
+                waiting[place] = waiting[place - 1]
+                place -= 1
+            waits_at[place] = distance
+            waiting[place] = CHILDREN * node + 1 + child
+            end += 1
+    return end
 
 
 @numba.njit(inline="always", **PLAIN)
@@ -160,25 +202,53 @@ def _inverse(component: float) -> float:
 
 
 @numba.njit(inline="always", **PLAIN)
-def _entry(boxes: np.ndarray, node: int, origin: Vector, reciprocal: Vector) -> float:
-    """Return where a ray enters a node's box, at least 0; infinite if it does not."""
-    low = _corner(boxes, node, 0)
-    high = _corner(boxes, node, 1)
+def _entry(boxes: np.ndarray, node: int, child: int, origin: Vector, reciprocal: Vector) -> float:
+    """Return where a ray enters the box of a node's child, at least 0; infinite if it does not."""
     entry = 0.0
     leave = np.inf
     for axis in range(3):
+        low = boxes[node, axis, child]
+        high = boxes[node, HIGH + axis, child]
         if reciprocal[axis] == 0.0:
-            if origin[axis] < low[axis] or origin[axis] > high[axis]:
+            if origin[axis] < low or origin[axis] > high:
                 return np.inf
             continue
-        to_low = (low[axis] - origin[axis]) * reciprocal[axis]
-        to_high = (high[axis] - origin[axis]) * reciprocal[axis]
+        to_low = (low - origin[axis]) * reciprocal[axis]
+        to_high = (high - origin[axis]) * reciprocal[axis]
         first = to_low if reciprocal[axis] > 0.0 else to_high
         last = to_high if reciprocal[axis] > 0.0 else to_low
         entry = first if first > entry else entry
         leave = last if last < leave else leave
-    # a flat box is entered where it is left, but for rounding
-    return entry if entry <= leave * (1.0 + 4e-16) else np.inf
+    return entry if entry <= leave * FLAT else np.inf
+
+
+@numba.njit(inline="always", **PLAIN)
+def _enter(
+    boxes: np.ndarray, node: int, origin: Vector, reciprocal: Vector, entries: np.ndarray
+) -> None:
+    """Set ``entries`` (4,) to the `_entry` into each child of a node, for a ray across no axis:
+    without branches, so that all four are computed at once."""
+    x, y, z = origin
+    per_x, per_y, per_z = reciprocal
+    near_x = 0 if per_x > 0.0 else HIGH
+    near_y = 1 if per_y > 0.0 else HIGH + 1
+    near_z = 2 if per_z > 0.0 else HIGH + 2
+    far_x = HIGH - near_x
+    far_y = HIGH + 2 - near_y
+    far_z = HIGH + 4 - near_z
+    for child in range(CHILDREN):
+        first_x = (boxes[node, near_x, child] - x) * per_x
+        first_y = (boxes[node, near_y, child] - y) * per_y
+        first_z = (boxes[node, near_z, child] - z) * per_z
+        last_x = (boxes[node, far_x, child] - x) * per_x
+        last_y = (boxes[node, far_y, child] - y) * per_y
+        last_z = (boxes[node, far_z, child] - z) * per_z
+        entry = first_x if first_x > 0.0 else 0.0
+        entry = first_y if first_y > entry else entry
+        entry = first_z if first_z > entry else entry
+        leave = last_x if last_x < last_y else last_y
+        leave = last_z if last_z < leave else leave
+        entries[child] = entry if entry <= leave * FLAT else np.inf
 
 
 @numba.njit(inline="always", **PLAIN)
@@ -209,58 +279,86 @@ def _closest_places(
     numbers: np.ndarray,
     boxes: np.ndarray,
     points: np.ndarray,
+    known: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     closest = np.full(len(points), -1, np.int64)
     feet = np.zeros((len(points), 3))
-    leaves = len(boxes) // 2
     waiting = np.empty(MOST_WAITING, np.int64)
+    waits_at = np.empty(MOST_WAITING)
+    squares = np.empty(CHILDREN)
     for i in range(len(points)):
         point = _row(points, i)
-        nearest = np.inf
-        if i > 0:
-            # the place closest to the point before it bounds the search, but may not be the first
-            before = _row(feet, i - 1)
-            nearest = (1.0 + 1e-12) * _square_off(before, before, point)
-        waiting[0] = 1
-        size = 1
-        while size > 0:
-            size -= 1
-            node = waiting[size]
-            if _square_off(_corner(boxes, node, 0), _corner(boxes, node, 1), point) > nearest:
-                continue
-            if node >= leaves:
-                begin = (node - leaves) * LEAF
-                for j in range(begin, min(begin + LEAF, len(corners))):
-                    place = _closest(corners, j, point)
-                    square = _square_off(place, place, point)
-                    is_first = square == nearest and numbers[j] < closest[i]
-                    if square < nearest or is_first:
-                        nearest = square
-                        closest[i] = numbers[j]
-                        feet[i, 0] = place[0]
-                        feet[i, 1] = place[1]
-                        feet[i, 2] = place[2]
-                continue
-            near_node = 2 * node
-            far = near_node + 1
-            near_square = _square_off(
-                _corner(boxes, near_node, 0), _corner(boxes, near_node, 1), point
+        farthest = np.inf
+        if len(known) > 0:
+            farthest = WIDER * _square_off(_row(known, i), point)
+        elif i > 0:  # the place closest to the point before it bounds the search
+            farthest = WIDER * _square_off(_row(feet, i - 1), point)
+        number, place = _closest_within(
+            corners, numbers, boxes, point, farthest, waiting, waits_at, squares
+        )
+        if number < 0:  # by rounding, if the known place is the point itself
+            number, place = _closest_within(
+                corners, numbers, boxes, point, np.inf, waiting, waits_at, squares
             )
-            far_square = _square_off(_corner(boxes, far, 0), _corner(boxes, far, 1), point)
-            if far_square < near_square:
-                near_node, far = far, near_node
-            waiting[size] = far
-            waiting[size + 1] = near_node
-            size += 2
+        closest[i] = number
+        feet[i, 0] = place[0]
+        feet[i, 1] = place[1]
+        feet[i, 2] = place[2]
     return closest, feet
 
 
+@numba.njit(**PLAIN)
+def _closest_within(
+    corners: np.ndarray,
+    numbers: np.ndarray,
+    boxes: np.ndarray,
+    point: Vector,
+    farthest: float,
+    waiting: np.ndarray,
+    waits_at: np.ndarray,
+    squares: np.ndarray,
+) -> tuple[int, Vector]:
+    """Return the number of the triangle closest to a point, and the place on it; -1 if the square
+    of every distance is larger than ``farthest``. The last three arrays are for its own use."""
+    closest = -1
+    foot = (0.0, 0.0, 0.0)
+    nearest = farthest
+    waiting[0] = 0
+    waits_at[0] = 0.0
+    size = 1
+    while size > 0:
+        size -= 1
+        node = waiting[size]
+        if waits_at[size] > nearest:
+            continue
+        if node >= len(boxes):
+            begin = (node - len(boxes)) * LEAF
+            for j in range(begin, min(begin + LEAF, len(corners))):
+                place = _closest(corners, j, point)
+                square = _square_off(place, point)
+                is_first = square == nearest and (closest < 0 or numbers[j] < closest)
+                if square < nearest or is_first:
+                    nearest = square
+                    closest = numbers[j]
+                    foot = place
+            continue
+        for child in range(CHILDREN):
+            squares[child] = 0.0
+            for axis in range(3):
+                below = boxes[node, axis, child] - point[axis]
+                above = point[axis] - boxes[node, HIGH + axis, child]
+                off = max(below, above, 0.0)
+                squares[child] += off * off
+        size = _wait(waiting, waits_at, size, node, squares, min(nearest, FINITE))
+    return closest, foot
+
+
 @numba.njit(inline="always", **PLAIN)
-def _square_off(low: Vector, high: Vector, point: Vector) -> float:
-    """Return the square of a point's distance from a box."""
+def _square_off(place: Vector, point: Vector) -> float:
+    """Return the square of a point's distance from a place."""
     square = 0.0
     for axis in range(3):
-        off = max(low[axis] - point[axis], point[axis] - high[axis], 0.0)
+        off = max(place[axis] - point[axis], point[axis] - place[axis], 0.0)
         square += off * off
     return square
 

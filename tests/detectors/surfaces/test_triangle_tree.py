@@ -57,6 +57,19 @@ def test_the_closest_place_is_on_the_closest_triangle() -> None:
         assert sampled_distance(SCATTERED[number[i]], feet[i]) < 0.02
 
 
+def test_known_places_change_nothing() -> None:
+    """Those of other points, and the points' own: there, rounding may let none be closer."""
+    points = DRAWS.uniform(-2.0, 2.0, (60, 3))
+    tree = tree_of(SCATTERED)
+    number, feet = closest_places(tree, points)
+    for known in (feet, np.roll(feet, 1, axis=0)):
+        again, again_feet = closest_places(tree, points, known)
+        np.testing.assert_array_equal(again, number)
+        np.testing.assert_array_equal(again_feet, feet)
+    on_itself, _ = closest_places(tree, feet, feet)
+    assert (on_itself >= 0).all()
+
+
 def test_equal_distances_and_flat_boxes() -> None:
     """A flat square of two triangles, twice: boxes without depth, and ties on all of it."""
     square = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[1, 1, 1], [0, 1, 1], [1, 0, 1]]], float)
