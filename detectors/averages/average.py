@@ -212,6 +212,8 @@ class FrameSums:
         self.channels: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # sums and numbers by name
         self.rgb_total: np.ndarray | None = None
         self.rgb_frames = 0
+        self.rgb_fixed: np.ndarray | None = None  # a read-only picture that frames share
+        self.rgb_repeats = 0  # how often it came again
         self.left_out: list[LeftOut] = []
         for frame in frames:
             self.take(frame)
@@ -318,10 +320,20 @@ class FrameSums:
         if frame.amplitude is not None:
             self._take_channel("amplitude", frame.amplitude, used)
         if frame.rgb is not None:
-            if self.rgb_total is None:
-                self.rgb_total = np.zeros(frame.rgb.shape, np.uint32)
-            self.rgb_total += frame.rgb
-            self.rgb_frames += 1
+            self._take_colour(frame.rgb)
+
+    def _take_colour(self, rgb: np.ndarray) -> None:
+        """Add a frame's colour. One picture for all frames, as of a simulated camera, is added
+        once: as it is read-only, it is the same whenever it comes."""
+        self.rgb_frames += 1
+        if rgb is self.rgb_fixed:
+            self.rgb_repeats += 1
+            return
+        if self.rgb_total is None:
+            self.rgb_total = np.zeros(rgb.shape, np.uint32)
+        self.rgb_total += rgb
+        if self.rgb_fixed is None and rgb.flags.owndata and not rgb.flags.writeable:
+            self.rgb_fixed = rgb
 
     def _take_channel(
         self,
@@ -380,7 +392,10 @@ class FrameSums:
         reason[never] = np.argmax(self.reasons[:, never], axis=0)
         rgb = None
         if self.rgb_total is not None:
-            rgb = np.round(self.rgb_total / self.rgb_frames).astype(np.uint8)
+            rgb_total = self.rgb_total
+            if self.rgb_fixed is not None:
+                rgb_total = rgb_total + np.uint32(self.rgb_repeats) * self.rgb_fixed
+            rgb = np.round(rgb_total / self.rgb_frames).astype(np.uint8)
         amplitude = means.get("amplitude")
         return Cloud(
             points_m=points_m.reshape(*self.shape, 3),

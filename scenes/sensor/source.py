@@ -96,9 +96,11 @@ class SimulatedUnit:
 
     @cached_property
     def rgb(self) -> np.ndarray:
-        """Colour (h, w, 3) uint8 on the depth pixels: the albedo, evenly lit, without noise of a
-        colour camera."""
-        return np.asarray(np.round(255 * self.view.rgb[self.cut]), np.uint8)
+        """Colour (h, w, 3) uint8 on the depth pixels, read-only: the albedo, evenly lit, without
+        noise of a colour camera."""
+        rgb = np.asarray(np.round(255 * self.view.rgb[self.cut]), np.uint8)
+        rgb.flags.writeable = False
+        return rgb
 
     @property
     def cut(self) -> tuple[slice, slice]:

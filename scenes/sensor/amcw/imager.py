@@ -222,8 +222,10 @@ class AmcwImager(UnitModel[AmcwCamera]):
         """Light (h, w) that a pixel gathers from a surface of given radiance, relative to the
         axis: |d slopes / d pixel| cos^4. Not modelled: mechanical vignetting, and growth of the
         pupil with angle."""
+        x = self.slopes[..., 0]
+        y = self.slopes[..., 1]
         spans = pixel_spans(self.camera.nominal_lens, self.slopes)
-        return spans / (1 + (self.slopes**2).sum(axis=-1)) ** 2
+        return np.asarray(spans / (1 + (x * x + y * y)) ** 2)
 
     def pattern_mm(self, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
         """Draw smooth and pixel-wise range errors, before the filter."""
@@ -375,7 +377,7 @@ class AmcwImager(UnitModel[AmcwCamera]):
         sines = np.sin(self._phase_steps)
         re = np.einsum("fkn,k->fn", exposure.means, cosines)
         im = np.einsum("fkn,k->fn", exposure.means, sines)
-        amplitudes = self.gains[:, None] * np.hypot(re, im) * 2 / len(cosines)
+        amplitudes = self.gains[:, None] * np.sqrt(re * re + im * im) * 2 / len(cosines)
         return np.asarray(amplitudes.sum(axis=0))
 
     def frame(

@@ -156,6 +156,8 @@ class LensFacts(Config):
 
     def outside_field(self, region: Region) -> np.ndarray:
         """Return (h, w) bool: pixels beyond the lens's image."""
+        if np.isinf(self.image_radius):
+            return np.zeros(region.shape, bool)
         lens = self.lens()
         v, u = np.mgrid[region.row0 : region.row1, region.col0 : region.col1]
         return np.asarray(

@@ -37,9 +37,11 @@ class DecodedFrame(NamedTuple):
 def rays_of(slopes: np.ndarray, offset_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, (h, w) each, an offset's (3,) component along each pixel's unit ray, and the ray's
     cosine to the axis."""
-    rays = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    length = np.linalg.norm(rays, axis=-1)
-    return rays @ offset_m / length, 1 / length
+    x = slopes[..., 0]
+    y = slopes[..., 1]
+    length = np.sqrt(x * x + y * y + 1)
+    along_m = x * offset_m[0] + y * offset_m[1] + offset_m[2]
+    return along_m / length, 1 / length
 
 
 def smooth_field(white: np.ndarray, length_px: float) -> np.ndarray:

@@ -383,6 +383,31 @@ def test_never_valid_pixels_carry_the_commonest_reason() -> None:
     assert np.isnan(cloud.variance_m2[0, 1])
 
 
+def test_one_colour_picture_of_many_frames_counts_as_often_as_it_comes() -> None:
+    stack = noisy(9)
+    random = np.random.default_rng(5)
+    shared, other = random.integers(0, 256, (2, *stack.z_m.shape[1:], 3)).astype(np.uint8)
+    shared = shared.copy()
+    shared.flags.writeable = False
+    pictures = [shared] * 9
+    pictures[3] = other
+    pictures[7] = other
+    cloud = average(replace(stack, extra={"rgb": pictures}), AverageConfig())
+    expected = np.round(np.mean(pictures, axis=0))
+    np.testing.assert_array_equal(cloud.rgb, expected)
+
+
+def test_a_colour_picture_that_is_filled_anew_counts_as_what_it_shows() -> None:
+    stack = noisy(4)
+    picture = np.zeros((*stack.z_m.shape[1:], 3), np.uint8)
+    first, *others = stack.frames()
+    sums = FrameSums(stack, [replace(first, rgb=picture)], AverageConfig())
+    for number, frame in enumerate(others, 1):
+        picture[:] = 10 * number
+        sums.take(replace(frame, rgb=picture))
+    assert (sums.cloud().rgb == 15).all()
+
+
 def test_colour_amplitude_and_xy_are_averaged() -> None:
     stack = noisy(4)
     random = np.random.default_rng(4)
