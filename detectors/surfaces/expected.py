@@ -431,13 +431,13 @@ def met_from(
         starts = np.column_stack([rays, np.full(len(rays), -FAR_M)])
         along = np.eye(3)[[2] * len(rays)]
     by_place = (len(rays), len(poses), 3)
-    origin = np.empty(by_place)
-    ray = np.empty(by_place)
+    origins = np.empty(by_place)
+    ways = np.empty(by_place)
     for number, T_part_camera in enumerate(poses):
-        origin[:, number] = transform_points(T_part_camera, starts)
-        ray[:, number] = rotate_vectors(T_part_camera, along)
-    origin = origin.reshape(-1, 3)
-    ray = ray.reshape(-1, 3)
+        origins[:, number] = transform_points(T_part_camera, starts)
+        ways[:, number] = rotate_vectors(T_part_camera, along)
+    origin = origins.reshape(-1, 3)
+    ray = ways.reshape(-1, 3)
     triangle, shares = first_hits(triangles.tree, origin, ray)
     is_hit = triangle >= 0
     number_of = np.where(is_hit, triangle, 0)

@@ -142,11 +142,11 @@ def read_view(path: Path) -> NoiseFreeView | None:
             facts = json.loads(str(_array_in(archive, "facts")))
             if facts.pop("version") != VIEW_VERSION:
                 return None
-            arrays = {name: _array_in(archive, name) for name in ARRAYS}
+            facts |= {name: _array_in(archive, name) for name in ARRAYS}
         facts["region"] = Region(**facts["region"])
         for name in ("frequencies_hz", "surface_names"):
             facts[name] = tuple(facts[name])
-        view = NoiseFreeView(**facts, **arrays)
+        view = NoiseFreeView(**facts)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
     with contextlib.suppress(OSError):  # a read-only cache works too
