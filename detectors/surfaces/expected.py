@@ -189,7 +189,7 @@ def fitted(
     T = T_start
     pitch_m = spacing(points)
     information = np.zeros((6, 6))
-    feet = None
+    feet: np.ndarray | None = None
     for step in range(3 * STEPS if known else 0, 4 * STEPS):
         by_planes = step >= 3 * STEPS
         moved = transform_points(T, points)

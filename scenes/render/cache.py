@@ -108,7 +108,9 @@ def write_view(path: Path, view: NoiseFreeView) -> None:
         for name, array in {"facts": np.array(json.dumps(facts)), **arrays}.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as part:
                 _write_array(part, np.asanyarray(array, order="C"))
-    buffer.write(_checksum(buffer.getvalue()))
+    with buffer.getbuffer() as content:
+        checksum = _checksum(content)
+    buffer.write(checksum)
     write_bytes(path, buffer.getvalue(), durable=False)
 
 

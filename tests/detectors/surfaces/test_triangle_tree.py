@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from detectors.surfaces.triangle_tree import LEAF, closest_places, first_hits, tree_of
+from detectors.surfaces.triangle_tree import (
+    CHILDREN,
+    LEAF,
+    _enter,
+    _entry,
+    closest_places,
+    first_hits,
+    tree_of,
+)
 
 DRAWS = np.random.default_rng(44)
 SCATTERED = DRAWS.uniform(-1.0, 1.0, (83, 1, 3)) + DRAWS.normal(0.0, 0.2, (83, 3, 3))
@@ -44,6 +52,21 @@ def test_rays_meet_the_triangle_that_is_first_of_all() -> None:
         met_point = origins[i] + distances.min() * directions[i]
         np.testing.assert_allclose(shares[i] @ SCATTERED[number[i]], met_point, atol=1e-9)
     assert 60 < (number >= 0).sum() < 290
+
+
+def test_four_boxes_at_once_are_entered_as_one_by_one() -> None:
+    boxes = tree_of(SCATTERED).boxes
+    entries = np.empty(CHILDREN)
+    is_entered = []
+    for node in range(len(boxes)):
+        for _ in range(20):
+            origin = tuple(DRAWS.uniform(-1.5, 1.5, 3))
+            reciprocal = tuple(1.0 / DRAWS.uniform(-1.0, 1.0, 3))
+            _enter.py_func(boxes, node, origin, reciprocal, entries)
+            for child in range(CHILDREN):
+                assert entries[child] == _entry.py_func(boxes, node, child, origin, reciprocal)
+            is_entered += np.isfinite(entries).tolist()
+    assert 0.05 < np.mean(is_entered) < 0.95
 
 
 def test_the_closest_place_is_on_the_closest_triangle() -> None:
