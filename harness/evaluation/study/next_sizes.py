@@ -5,7 +5,7 @@ Over these curves, a90 and the probability p(x) of a hit at each size x vary tog
 outcome at x, a hit or a miss, has the variance of p(x) and the mean of p (1 - p) besides. So it
 leaves of a90 the variance Var(a90) - Cov(a90, p(x))^2 / (Var p(x) + E p (1 - p)), and variances and
 covariances after it are those of linear regression on it (Bayes linear statistics: Goldstein and
-Wooff 2007, chapter 3). Simulated studies of three curves end with 14 to 25 % fewer boards than
+Wooff 2007, chapter 3). Simulated studies of three curves end with 12 to 25 % fewer boards than
 with a third of the sizes about a50 and two thirds about a90.
 
 Not modelled: boards that differ, whose damages tell less than as many of other boards."""
