@@ -80,7 +80,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints, fragments)
-    explained = _at_steps(cloud, evidence, detections)
+    explained = at_steps(cloud, evidence, detections)
     if explained:
         evidence = replace(evidence, notes={**evidence.notes, "at_steps": len(explained)})
         left = [number for number in range(len(detections)) if number not in explained]
@@ -91,7 +91,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     return with_remarks(result, threshold)
 
 
-def _at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
+def at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
     """Return the numbers of the findings that the uncertain steps of a profile explain."""
     # a reference has an error everywhere, which the tolerances count
     if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
