@@ -66,8 +66,8 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         _measured(detector, cloud, evidence, detection) for detection in detections
     )
     joints = joints_of(cloud, evidence, detections, measurements)
+    touching: list[TouchingDamage] = []
     if joints:
-        touching: list[TouchingDamage] = []
         fragments: list[int] = []
         for feature in joints:
             fragments += fragments_of(cloud, evidence, detections, measurements, feature)
@@ -80,7 +80,13 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints, fragments)
-    explained = at_steps(cloud, evidence, detections)
+    # what lies beyond a joint was compared with the other joints, which have the same steps
+    parted = {id(damage.detection) for damage in touching}
+    explained = [
+        number
+        for number in at_steps(cloud, evidence, detections)
+        if id(detections[number]) not in parted
+    ]
     if explained:
         evidence = replace(evidence, notes={**evidence.notes, "at_steps": len(explained)})
         left = [number for number in range(len(detections)) if number not in explained]
