@@ -84,7 +84,7 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     parted = {id(damage.detection) for damage in touching}
     explained = [
         number
-        for number in at_steps(cloud, evidence, detections)
+        for number in at_steps(cloud, evidence, detections, threshold)
         if id(detections[number]) not in parted
     ]
     if explained:
@@ -97,12 +97,14 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     return with_remarks(result, threshold)
 
 
-def at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
+def at_steps(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], threshold: float
+) -> tuple[int, ...]:
     """Return the numbers of the findings that the uncertain steps of a profile explain."""
     # a reference has an error everywhere, which the tolerances count
     if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
         return ()
-    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
+    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections, threshold)
 
 
 def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:

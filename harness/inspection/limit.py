@@ -211,7 +211,7 @@ def _counted(
     searched = np.isfinite(result.evidence.score)
     evidence = replace(evidence, score=np.where(searched, evidence.score, np.nan))
     detections = detector.find(pressed, evidence, threshold)
-    explained = at_steps(pressed, evidence, detections)
+    explained = at_steps(pressed, evidence, detections, threshold)
     is_found = np.zeros(pressed.valid.size, bool)
     for number, detection in enumerate(detections):
         if number not in explained:

@@ -114,7 +114,7 @@ def test_steps_explain_nothing_that_was_parted_from_a_joint(
     monkeypatch.setattr(judging, "joints_of", lambda *_: (Joints((0,), ()),))
     monkeypatch.setattr(judging, "fragments_of", lambda *_: ())
     monkeypatch.setattr(judging, "damage_beside", lambda *_: (touching,))
-    monkeypatch.setattr(judging, "at_steps", lambda cloud, evidence, found: range(len(found)))
+    monkeypatch.setattr(judging, "at_steps", lambda cloud, evidence, found, _: range(len(found)))
     detector = cast(Detector, Finds(result))
     left = judging.judged(detector, result.cloud, result.evidence, 5.0)
     assert [detection is beside for detection in left.detections] == [True]
