@@ -21,11 +21,15 @@ SIGMAS = 3.0  # of the profile's own deviation that it explains
 
 
 def explained_by_steps(
-    spread_m: np.ndarray, residual_m: np.ndarray, detections: Sequence[Detection]
+    spread_m: np.ndarray,
+    residual_m: np.ndarray,
+    detections: Sequence[Detection],
+    threshold: float,
 ) -> tuple[int, ...]:
     """Return the numbers of the findings by depth, but joints, that lie mostly at or beside
     uncertain pixels of a profile, and on these depart by no more than `SIGMAS` of its own deviation
-    on average.
+    on average. As one error, and not one of each pixel, makes a score larger by up to the root of
+    the number of these pixels, what exceeds the ``threshold`` by more is not explained.
 
     Args:
         spread_m: (h, w), standard deviation of the surface itself; 0 or NaN where it is certain.
@@ -44,6 +48,8 @@ def explained_by_steps(
         beside = is_beside[detection.pixels]
         own = own_m[detection.pixels]
         if departing_m[beside].sum() < MOSTLY * departing_m.sum() or not own.any():
+            continue
+        if detection.score > threshold * np.sqrt(np.count_nonzero(own)):
             continue
         deviation_m = float(np.sqrt((own[own > 0] ** 2).mean()))
         if departing_m[own > 0].mean() <= SIGMAS * deviation_m:

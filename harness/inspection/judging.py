@@ -66,8 +66,8 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         _measured(detector, cloud, evidence, detection) for detection in detections
     )
     joints = joints_of(cloud, evidence, detections, measurements)
+    touching: list[TouchingDamage] = []
     if joints:
-        touching: list[TouchingDamage] = []
         fragments: list[int] = []
         for feature in joints:
             fragments += fragments_of(cloud, evidence, detections, measurements, feature)
@@ -80,7 +80,13 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
         notes = {**evidence.notes, "joints": joints_facts(joints, measurements)}
         evidence = replace(evidence, notes=notes)
         detections, measurements = joined(detections, measurements, joints, fragments)
-    explained = _at_steps(cloud, evidence, detections)
+    # what lies beyond a joint was compared with the other joints, which have the same steps
+    parted = {id(damage.detection) for damage in touching}
+    explained = [
+        number
+        for number in at_steps(cloud, evidence, detections, threshold)
+        if id(detections[number]) not in parted
+    ]
     if explained:
         evidence = replace(evidence, notes={**evidence.notes, "at_steps": len(explained)})
         left = [number for number in range(len(detections)) if number not in explained]
@@ -91,12 +97,14 @@ def judged(detector: Detector, cloud: Cloud, evidence: Evidence, threshold: floa
     return with_remarks(result, threshold)
 
 
-def _at_steps(cloud: Cloud, evidence: Evidence, detections: Sequence[Detection]) -> tuple[int, ...]:
+def at_steps(
+    cloud: Cloud, evidence: Evidence, detections: Sequence[Detection], threshold: float
+) -> tuple[int, ...]:
     """Return the numbers of the findings that the uncertain steps of a profile explain."""
     # a reference has an error everywhere, which the tolerances count
     if cloud.expected is not None or not isinstance(evidence, LocalEvidence):
         return ()
-    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections)
+    return explained_by_steps(evidence.spread_m, evidence.residual_m, detections, threshold)
 
 
 def _without_features(cloud: Cloud, missing: MissingReturns) -> MissingReturns:

@@ -19,6 +19,7 @@ import numpy as np
 from detectors.interface import Detector
 from detectors.pixels.masks import grown
 from harness.evaluation import intervals
+from harness.inspection.judging import at_steps
 from harness.inspection.verdict import pitch_mm, sight_lines, surface_points_m
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
@@ -209,9 +210,12 @@ def _counted(
     evidence = detector.analyse(pressed)
     searched = np.isfinite(result.evidence.score)
     evidence = replace(evidence, score=np.where(searched, evidence.score, np.nan))
+    detections = detector.find(pressed, evidence, threshold)
+    explained = at_steps(pressed, evidence, detections, threshold)
     is_found = np.zeros(pressed.valid.size, bool)
-    for detection in detector.find(pressed, evidence, threshold):
-        is_found[detection.pixels] = True
+    for number, detection in enumerate(detections):
+        if number not in explained:
+            is_found[detection.pixels] = True
     hits = sum(bool(is_found[floor].any()) for floor in floors)
     return _size_count(disc, hits, len(centres))
 

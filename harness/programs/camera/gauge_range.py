@@ -191,7 +191,7 @@ def _improved(image: RangeImage, gauge: SolidGauge, fit: RangeFit) -> RangeFit:
 
 
 class _Equations(NamedTuple):
-    """What an element says about the numbers of a fit, over its standard error."""
+    """The equations of an element for the numbers of a fit, over its standard error."""
 
     design: np.ndarray
     """(k, `NUMBERS`): derivatives by the motion about the gauge's origin, scale and bias."""

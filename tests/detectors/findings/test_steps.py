@@ -34,8 +34,8 @@ def test_a_row_is_explained_up_to_three_deviations_of_the_step(
     residual_m = np.zeros(SHAPE)
     residual_m[5:25, GROOVE] = sign * depth_m
     row = found(slice(5, 25), slice(GROOVE - 1, GROOVE + 2))
-    assert explained_by_steps(spread(), residual_m, [row]) == numbers
-    assert explained_by_steps(np.zeros(SHAPE), residual_m, [row]) == ()
+    assert explained_by_steps(spread(), residual_m, [row], 5.0) == numbers
+    assert explained_by_steps(np.zeros(SHAPE), residual_m, [row], 5.0) == ()
 
 
 def test_damage_beside_a_step_or_across_it_is_not_explained() -> None:
@@ -46,9 +46,18 @@ def test_damage_beside_a_step_or_across_it_is_not_explained() -> None:
     gone = found(slice(20, 30), slice(GROOVE, GROOVE + 1), kind="no return")
     joints = replace(at_step, count=5)
     findings = [beside, across, at_step, gone, joints]
-    assert explained_by_steps(spread(), residual_m, findings) == (2,)
+    assert explained_by_steps(spread(), residual_m, findings, 5.0) == (2,)
 
 
 def test_pixels_beside_a_step_alone_tell_nothing_about_it() -> None:
     residual_m = np.full(SHAPE, 1e-4)
-    assert explained_by_steps(spread(), residual_m, [found(slice(5, 9), slice(13, 14))]) == ()
+    assert explained_by_steps(spread(), residual_m, [found(slice(5, 9), slice(13, 14))], 5.0) == ()
+
+
+def test_one_error_of_twenty_pixels_raises_a_score_by_their_root() -> None:
+    residual_m = np.zeros(SHAPE)
+    residual_m[5:25, GROOVE] = 1e-3
+    row = found(slice(5, 25), slice(GROOVE - 1, GROOVE + 2))
+    for score, numbers in ((5.0 * 20**0.5 - 0.1, (0,)), (5.0 * 20**0.5 + 0.1, ())):
+        at_row = [replace(row, score=score)]
+        assert explained_by_steps(spread(), residual_m, at_row, 5.0) == numbers

@@ -3,14 +3,21 @@
 import argparse
 import math
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from detectors import load_detector
+from detectors.findings.beside_joints import TouchingDamage
+from detectors.findings.joints import Joints
 from detectors.findings.null import OwnThreshold, own_threshold
+from detectors.interface import Detection, Detector, Measurement
+from harness.inspection import judging
 from harness.inspection.judging import judged, null_facts, threshold_of
+from harness.report.findings import Judged
 from harness.vocabulary.files import plain_json
+from tests.harness.inspection.test_verdict import judged_of
 from tests.validation.odds import Case, capture
 
 DETECTOR = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
@@ -80,3 +87,36 @@ def test_calls_at_marks_are_stated_apart() -> None:
     assert null["at_marks"] > 0.05
     assert null["expected"] == pytest.approx(1.0 + null["at_marks"], rel=1e-6)
     assert "of them at objects, print and edges, from" in origin
+
+
+class Finds:
+    """A detector that finds what it is told to."""
+
+    def __init__(self, result: Judged) -> None:
+        self.result = result
+
+    def find(self, *_: object) -> tuple[Detection, ...]:
+        return self.result.detections
+
+    def measure(self, *_: object) -> Measurement:
+        return self.result.measurements[0]
+
+
+def test_steps_explain_nothing_that_was_parted_from_a_joint(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = judged_of(20.0, 19.0)
+    beside = replace(result.detections[1], score=18.0)
+    touching = TouchingDamage(0, beside, result.evidence)
+    monkeypatch.setattr(judging, "missing_returns", lambda *_: None)
+    monkeypatch.setattr(judging, "each_object_once", lambda cloud, evidence, found: found)
+    monkeypatch.setattr(judging, "one_damage_once", lambda shape, found, missing: found)
+    monkeypatch.setattr(judging, "joints_of", lambda *_: (Joints((0,), ()),))
+    monkeypatch.setattr(judging, "fragments_of", lambda *_: ())
+    monkeypatch.setattr(judging, "damage_beside", lambda *_: (touching,))
+    monkeypatch.setattr(judging, "at_steps", lambda cloud, evidence, found, _: range(len(found)))
+    detector = cast(Detector, Finds(result))
+    left = judging.judged(detector, result.cloud, result.evidence, 5.0)
+    assert [detection is beside for detection in left.detections] == [True]
+    assert len(left.measurements) == 1
+    assert left.evidence.notes["at_steps"] == 2
