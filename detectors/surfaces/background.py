@@ -285,7 +285,7 @@ def _shape_of(
     the points."""
     sample = points[:: max(1, len(points) // 8192)]
     quadratic = SurfaceConfig(degree=2, method="bisquare")
-    surface = fit_surface(*sample.T, quadratic)
+    surface = fit_surface(sample[:, 0], sample[:, 1], sample[:, 2], quadratic)
     _, start = _named(surface, sample, quadratic, cells.central)
     cells = cells.refreshed(points[:, 2] - start(points), start)
     shapes, errors = _formula_shapes(cells)
