@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -94,10 +95,19 @@ class _Gaps:
 
 
 def _gaps(cloud: Cloud, evidence: Evidence) -> _Gaps | None:
-    """Return what is missing inside the outline of the judged area; None without a pixel grid."""
+    """Return what is missing inside the outline of the judged area; None without a pixel grid.
+    A cloud keeps it by that area."""
     judged = np.isfinite(evidence.score)
     if not cloud.organised or not judged.any():
         return None
+    key = judged.tobytes()
+    if key not in cloud.gaps:
+        cloud.gaps[key] = _gaps_within(cloud, judged)
+    return cast("_Gaps", cloud.gaps[key])
+
+
+def _gaps_within(cloud: Cloud, judged: np.ndarray) -> _Gaps:
+    """Return what is missing inside the outline of the ``judged`` area (h, w) bool."""
     padded = np.pad(judged.astype(np.uint8), 2)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     outline = holes_filled(closed > 0)[2:-2, 2:-2]

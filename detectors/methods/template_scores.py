@@ -26,7 +26,7 @@ and too few of them are independent."""
 
 
 class TemplateNoise(NamedTuple):
-    """What noise makes of the templates."""
+    """The worth of templates under a noise."""
 
     window_px: int
     """Side of the camera's window that the noise indicates."""
@@ -63,7 +63,7 @@ class PictureNoise(NamedTuple):
     """(r, c): variance of independent pixels whose means over `BLOCK_PX` vary as those at their
     distance from the outline do beyond it."""
     on_templates: TemplateNoise
-    """What it makes of the templates."""
+    """The worth of templates under it."""
 
     @property
     def bank(self) -> tuple[templates.Template, ...]:

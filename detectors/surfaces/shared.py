@@ -22,7 +22,7 @@ def shared(
     to it.
 
     A cloud keeps its surfaces by kind, mask and settings. Raises UserError as ``fit`` does."""
-    key = fit.__name__, config.model_dump_json(), hashlib.blake2b(mask.tobytes()).digest()
+    key = fit, config.model_dump_json(), hashlib.blake2b(mask.tobytes()).digest()
     if key not in cloud.surfaces:
         cloud.surfaces[key] = fit(cloud, mask, config)
     return cast("Fitted", cloud.surfaces[key])

@@ -370,6 +370,11 @@ class Cloud:
         """Objects and print on it by what is judged: several detectors share them."""
         return {}
 
+    @cached_property
+    def gaps(self) -> dict[Any, Any]:
+        """Its pixels without a return by what is judged: several detectors share them."""
+        return {}
+
     @property
     def valid(self) -> np.ndarray:
         """The pixels that have a point, (h, w) bool."""
