@@ -206,7 +206,8 @@ def _fewer_set_ups(data: Any, costs: _Costs) -> list[str]:
     axes: Axes = {}
     if isinstance(written, Mapping):
         for path, values in written.items():
-            if path != FRAMES and isinstance(values, list) and values:
+            is_axis = isinstance(path, str) and isinstance(values, list)
+            if is_axis and path != FRAMES and values:
                 axes[path] = values
     draws = _number(data, "draws")
     if draws is not None:
