@@ -14,12 +14,15 @@ from harness.evaluation.study.unknowns import UnknownEffect
 from harness.report.blocks import template
 from harness.tables.unknowns import level_text, unknown_names
 
-WIDTH_PX = 600
+WIDTH_PX = 500
+"""Its text is then readable on a screen of 400 pixels."""
 ROW_PX = 36
 BAR_PX = 20
 TOP_PX = 6
 BELOW_PX = 66
 """Height of the axis with its title, and of the key."""
+KEY_PX = 180
+"""Distance of the entries of the key."""
 MARGIN_PX = 16
 LETTER_PX = 6.6
 """About the mean width of a letter; names on the left have as much room as the longest needs."""
@@ -28,7 +31,7 @@ GAP_PX = 6
 """Distance of a value from the end of its bar."""
 ROOM = 1.3
 """Right end of the axis over the largest size inspected."""
-MOST_TICKS = 8
+MOST_TICKS = 7
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def tornado_figure(result: SetUpResult, stated_mm: float) -> str:
             "x": axis.px(size_mm),
             "name": text,
             "dashes": "5 3" if text == "at the stated values" else "none",
-            "key_x": axis.left_px + 200 * number,
+            "key_x": axis.left_px + KEY_PX * number,
         }
         lines.append(line)
     bottom_px = TOP_PX + ROW_PX * len(rows)

@@ -21,7 +21,6 @@ from harness.vocabulary.geometry import Cloud
 from harness.vocabulary.text import many
 from scenes.sensor.common.config import CameraConfig
 from scenes.target.custom import BoardConfig, TargetConfig
-from scenes.target.mesh import board_solid
 
 
 @dataclass(frozen=True)
@@ -86,6 +85,9 @@ def compared(
 @lru_cache(maxsize=8)
 def _drawing(board: BoardConfig) -> Drawing:
     """Return a board's drawing, board frame."""
+    # loads the library of meshes, which takes 0.1 s and few studies need
+    from scenes.target.mesh import board_solid
+
     solid = board_solid(TargetConfig(board=board), ())
     return drawing_of("the drawing", np.asarray(solid.vertices)[np.asarray(solid.faces)])
 
