@@ -13,8 +13,6 @@ from detectors.findings.tails import Tail, calls_at, threshold_at
 from detectors.findings.virtual_holes import VirtualHoles
 from detectors.interface import Detection, Evidence
 from detectors.methods.part import part_of_cloud, part_of_evidence
-from detectors.surfaces.background import Background, background
-from detectors.surfaces.surface import SurfaceConfig
 from harness.inspection import arguments as cli
 from harness.inspection import choosing
 from harness.inspection.choosing import Contender, _is_better, candidate_of, chosen
@@ -50,21 +48,14 @@ def test_the_same_residuals_have_the_same_scores(name: str, cloud: Cloud) -> Non
     assert np.nanmin(deeper.score[inside]) > 3.0 * np.nanmax(evidence.score[inside])
 
 
-def test_candidates_share_one_fit_of_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
-    fits = []
-
-    def counted(cloud: Cloud, mask: np.ndarray, config: SurfaceConfig) -> Background:
-        fits.append(config)
-        return background(cloud, mask, config)
-
-    monkeypatch.setattr("detectors.surfaces.shared.background", counted)
+def test_candidates_share_one_fit_of_the_surface() -> None:
     fresh = plane(seed=6)
     for name in cli.CANDIDATES:
         load_detector(name, SETTINGS).analyse(fresh)
-    assert len(fits) == 1
+    assert len(fresh.surfaces) == 1  # a cloud keeps each surface that was fitted to it
     polynomial = {**SETTINGS, "surface": {"shape": "polynomial", "degree": 2}}
     load_detector("local", polynomial).analyse(fresh)
-    assert len(fits) == 2
+    assert len(fresh.surfaces) == 3  # a polynomial, and the background that takes it
 
 
 @pytest.mark.parametrize("name", cli.CANDIDATES)
