@@ -22,6 +22,10 @@ from detectors.findings.shapes import Shape
 PRIOR: dict[Shape, float] = {"disc": 0.7, "cap": 0.15, "bowl": 0.15, "slot": 0.1}
 """Prior weights: more damage is drilled or punched than pressed. They decide only where the blur
 hides the shape."""
+PARAMETERS: dict[Shape, int] = {"disc": 5, "cap": 5, "bowl": 5, "slot": 7}
+"""Parameters of each shape in the information criterion."""
+LEAST_WEIGHT = 1e-9
+"""Weight beside the best shape's below which a shape changes no digit of an average."""
 WIDER: dict[Shape, float] = {"disc": 1.0, "cap": 1.25, "bowl": 1.6, "slot": 1.0}
 """Mouth of each shape, in mouths of a disc with the same volume and deepest residual."""
 BLURS = (
@@ -112,11 +116,9 @@ class ShapeFit:
     def criterion(self) -> float:
         """Bayesian information criterion; the variance of the residuals is unknown."""
         fit = self.fit
-        parameters = 7 if fit.shape == "slot" else 5
-        independent = max(fit.independent, parameters + 1.0)
+        independent = _independent(fit.shape, fit.independent)
         per_pixel = max(fit.chi_square, 1e-12) / independent
-        penalty = parameters * math.log(independent) + self.loss
-        return independent * math.log(per_pixel) + penalty
+        return independent * math.log(per_pixel) + _penalty(fit.shape, independent, self.loss)
 
     @property
     def raised(self) -> float:
@@ -174,6 +176,30 @@ class ShapeFit:
         return fitted_m2 + by_radius_m2 + (DEPTH_ERROR * fit.depth_m) ** 2
 
 
+def _independent(shape: Shape, independent: float) -> float:
+    """Return the number of independent pixels, at least one more than the shape's parameters."""
+    return max(independent, PARAMETERS[shape] + 1.0)
+
+
+def _penalty(shape: Shape, independent: float, loss: float) -> float:
+    """Return what the information criterion adds for a shape's parameters and for its blur."""
+    return PARAMETERS[shape] * math.log(independent) + loss
+
+
+def _largest_chi_square(
+    candidates: Sequence[ShapeFit], patch: HolePatch, shape: Shape, loss: float
+) -> float:
+    """Return the chi square beyond which a fit of a shape would weigh less than `LEAST_WEIGHT` of
+    the best candidate; infinite without candidates."""
+    if not candidates:
+        return math.inf
+    best = min(candidates, key=lambda candidate: candidate.criterion)
+    gap = 2.0 * math.log(PRIOR[shape] / (PRIOR[best.fit.shape] * LEAST_WEIGHT))
+    independent = _independent(shape, np.count_nonzero(patch.used) / math.prod(patch.noise_px))
+    log_ratio = (best.criterion + gap - _penalty(shape, independent, loss)) / independent
+    return independent * math.exp(log_ratio)
+
+
 def sized(
     patch: HolePatch,
     start: Start,
@@ -195,7 +221,8 @@ def sized(
             radius_m *= math.exp(-0.5 * start.stretch)
         first = replace(start, radius_m=radius_m)
         for blurred, loss in blurs:
-            fit = _fit(blurred, first, shape)
+            enough = _largest_chi_square(candidates, blurred, shape, loss)
+            fit = _fit(blurred, first, shape, enough)
             is_possible = is_blur_known or _is_possible(fit, blurred)
             if fit.converged and _is_determined(fit) and is_possible:
                 candidates.append(ShapeFit(fit, blurred, loss))
@@ -211,7 +238,7 @@ def _with_dim_floors(disc: ShapeFit) -> list[ShapeFit]:
     if disc.fit.depth_m > 0:
         for brightness in FLOORS:
             patch = replace(disc.patch, brightness=brightness)
-            fit = _fit(patch, _start_after(disc.fit), "disc")
+            fit = _fit(patch, _start_after(disc.fit), "disc", math.inf)
             if fit.converged and _is_determined(fit):
                 candidates.append(ShapeFit(fit, patch, disc.loss))
     return candidates
@@ -239,8 +266,8 @@ def _is_possible(fit: HoleFit, patch: HolePatch) -> bool:
     return normal_depth_m <= (1.0 + 2.0 * DEPTH_ERROR) * fit.radius_m
 
 
-def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:
-    """Fit one shape."""
+def _fit(patch: HolePatch, start: Start, shape: Shape, largest_chi_square: float) -> HoleFit:
+    """Fit one shape, unless it can hardly explain the pixels to this chi square."""
     return fit_hole(
         patch,
         start.u_px,
@@ -251,6 +278,7 @@ def _fit(patch: HolePatch, start: Start, shape: Shape) -> HoleFit:
         shape=shape,
         stretch=start.stretch,
         angle_rad=start.angle_rad,
+        largest_chi_square=largest_chi_square,
     )
 
 

@@ -52,6 +52,8 @@ TOLERANCE = 1e-5  # relative gain of a step below which the descent ends
 DAMPING = 1e-3  # of the first step
 SMALLEST = 1e-18  # square of a deviation that is only rounding error, square metres
 LEAST_M = 1e-9  # size of such a deviation
+MOST_GAIN = 10.0
+"""Times what the linear model of a step promises that later steps may still gain."""
 LONGEST = 3.0  # largest logarithm of a slot's length over its width
 
 # --- what is known beforehand ---
@@ -396,9 +398,11 @@ def fit_hole(
     shape: Shape = "disc",
     stretch: float = 0.0,
     angle_rad: float = 0.0,
+    largest_chi_square: float = math.inf,
 ) -> HoleFit:
     """Fit a damage of one shape to at least eight used pixels by least squares (Levenberg and
-    Marquardt) from start values. Its covariance is that of `sandwich_covariance`.
+    Marquardt) from start values. Its covariance is that of `sandwich_covariance`. The descent ends,
+    without having converged, where it can hardly come below ``largest_chi_square`` any more.
 
     The parameters are (u, v, ln radius, depth * radius^2, offset, x) with the wall sin^2(pi x / 2),
     which has `WALL_PRIOR`; of a slot, its stretch and angle instead of the wall. The fourth is the
@@ -408,6 +412,8 @@ def fit_hole(
     height, width = patch.used.shape
     volume = depth_m * radius_m**2
     x = WALL_PRIOR[0]
+    sharing = math.prod(patch.noise_px)
+    per_chi_square_m2 = max(patch.noise_m, LEAST_M) ** 2 * sharing
     hole, offset, rows, converged = _descent(
         patch.residual_m[patch.used],
         np.flatnonzero(patch.used),
@@ -422,12 +428,12 @@ def fit_hole(
         patch.weighing,
         height,
         width,
+        largest_chi_square * per_chi_square_m2,
     )
     derivatives = rows[:8]
     misfit = rows[8]
     square = float(misfit @ misfit)
     u, v, radius, depth, wall, stretch, angle = hole.tolist()
-    sharing = math.prod(patch.noise_px)
     return HoleFit(
         u_px=u,
         v_px=v,
@@ -440,7 +446,7 @@ def fit_hole(
         shape=shape,
         stretch=stretch,
         angle_rad=angle,
-        chi_square=square / max(patch.noise_m, LEAST_M) ** 2 / sharing,
+        chi_square=square / per_chi_square_m2,
         independent=len(misfit) / sharing,
     )
 
@@ -669,13 +675,18 @@ def _descent(  # type: ignore[no-untyped-def]
     weighing,
     h,
     w,
+    largest_square,
 ):
     """Return the best damage (7,) of a shape, its offset, rows (10, n) and whether the descent
     from ``start`` (8,) has converged.
 
     The first rows are derivatives of the used pixels, at flat indices ``pixels`` (n,), by (u, v,
     radius, depth, offset, wall, stretch, angle), 0 for those that the shape lacks; the ninth is the
-    damage minus ``data`` (n,); the tenth is that of the last trial. ``weight``: of the prior."""
+    damage minus ``data`` (n,); the tenth is that of the last trial. ``weight``: of the prior.
+
+    The descent ends where the sum of squares can hardly come below ``largest_square``: a step that
+    was taken has a linear model, and later steps gained at most `MOST_GAIN` times what it
+    promises."""
     n = len(data)
     parameters = start
     step = np.zeros(8)
@@ -722,7 +733,8 @@ def _descent(  # type: ignore[no-untyped-def]
             new_square += misfit[0, i] ** 2
         enough = TOLERANCE * square + SMALLEST
         converged = promised < enough or 0.0 <= square - new_square < enough
-        if trial == 0 or new_square < square:
+        is_taken = trial == 0 or new_square < square
+        if is_taken:
             parameters = trial_parameters
             square = new_square
             damping = 0.1 * damping
@@ -768,6 +780,8 @@ def _descent(  # type: ignore[no-untyped-def]
         if converged:
             break
         step, promised = _damped(products, damping)
+        if is_taken and square - MOST_GAIN * promised > largest_square:
+            break
     return best, parameters[4], rows, converged
 
 

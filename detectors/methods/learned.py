@@ -79,7 +79,7 @@ class LearnedDetector(MatchedDetector):
 
     settings_type: ClassVar[type[LearnedConfig]] = LearnedConfig
     name = "learned"
-    version = 2
+    version = 3
 
     def scored(
         self,

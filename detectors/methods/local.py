@@ -129,7 +129,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 6
+    version = 7
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings

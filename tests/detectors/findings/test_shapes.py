@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from detectors.findings import family
 from detectors.findings import hole_model_reference as reference
 from detectors.findings.family import (
     BLURS,
@@ -319,3 +320,44 @@ def test_a_slot_s_length_width_and_angle_lie_within_their_errors() -> None:
     assert 0.45 < length < 0.75
     assert 0.45 < width < 0.75
     assert 0.8 < angle < 1.2
+
+
+def noisy_hole(noise_m: float) -> HolePatch:
+    """A drilled hole of 12 mm radius in noise that the blur correlates."""
+    patch = patch_of(FRONTAL_PX_M, noise_m)
+    clear_m = pictures(patch, numbers_of("disc")[None])[0]
+    white = np.random.default_rng(4).standard_normal(clear_m.shape)
+    noise = cv2.blur(white, (5, 3)) * math.sqrt(15.0) * noise_m
+    return replace(patch, residual_m=clear_m + noise)
+
+
+def test_a_descent_ends_early_where_its_shape_cannot_explain_the_pixels() -> None:
+    patch = noisy_hole(1e-4)
+    start = (19.0, 18.0, 11e-3, 4e-3, 0.0)
+    disc = fit_hole(patch, *start)
+    cap = fit_hole(patch, *start, shape="cap")
+    assert cap.converged
+    assert cap.chi_square > 3.0 * disc.chi_square
+    assert not fit_hole(patch, *start, shape="cap", largest_chi_square=disc.chi_square).converged
+    again = fit_hole(patch, *start, shape="cap", largest_chi_square=cap.chi_square)
+    assert again.converged
+    np.testing.assert_array_equal(again.numbers, cap.numbers)
+    np.testing.assert_array_equal(again.covariance, cap.covariance)
+
+
+@pytest.mark.parametrize("noise_m", [1e-4, 5e-4, 2e-3])
+def test_shapes_that_are_left_out_change_no_size(
+    noise_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    patch = noisy_hole(noise_m)
+    start = Start(19.0, 18.0, 11e-3, 4e-3, 0.0, 0.0, 0.0)
+    size = sized(patch, start, ("disc", "cap", "bowl"), BLURS[:1])
+    monkeypatch.setattr(family, "LEAST_WEIGHT", 1e-300)
+    whole = sized(patch, start, ("disc", "cap", "bowl"), BLURS[:1])
+    assert size is not None
+    assert whole is not None
+    assert len(whole.weights) == 3
+    assert min(whole.weights.values()) < 1e-9 or size.weights == whole.weights
+    assert size.diameter_m == pytest.approx(whole.diameter_m, rel=1e-7)
+    assert size.depth_m == pytest.approx(whole.depth_m, rel=1e-7)
+    assert size.depth_se_m == pytest.approx(whole.depth_se_m, rel=1e-3)
