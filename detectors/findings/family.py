@@ -214,7 +214,7 @@ def sized(
         blur_px = (max(ratio * blur_u, 1.0), max(ratio * blur_v, 1.0))
         blurs.append((replace(patch, blur_px=blur_px, soft=soft), loss))
     is_blur_known = len(blur_choices) == 1
-    candidates = []
+    candidates: list[ShapeFit] = []
     for shape in shapes:
         radius_m = start.radius_m * WIDER[shape]
         if shape == "slot":
