@@ -54,6 +54,8 @@ def draw_frames() -> None:
 
 def analyse() -> None:
     """Average frames, and search for damage on every kind of surface."""
+    import numpy as np
+
     from detectors import load_detector
     from detectors.averages.average import AverageConfig, average
     from harness.vocabulary.geometry import Region
@@ -64,7 +66,8 @@ def analyse() -> None:
 
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
-    view.phasor[:, 18:24, 28:34] *= 1j
+    # so shallow that all of its pixels have a range, and the model of a hole is fitted
+    view.phasor[:, 18:24, 28:34] *= np.exp(0.1j)
     unit = SimulatedUnit(camera, CameraConfig(edge_gate=False), view)
     cloud = average(unit.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
