@@ -70,6 +70,10 @@ def analyse() -> None:
     view.phasor[:, 18:24, 28:34] *= np.exp(0.1j)
     unit = SimulatedUnit(camera, CameraConfig(edge_gate=False), view)
     cloud = average(unit.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
+    # pixels at the rim of a deep hole are simulated one by one
+    view.phasor[:, 18:24, 28:34] *= 1j
+    deep = SimulatedUnit(camera, CameraConfig(), view)
+    average(deep.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     wanted = [
