@@ -420,6 +420,7 @@ def _scored(
         mean, covered = _mean(clipped, (1.0 - sure) * weights, half)
         worth = np.sqrt(_worth((1.0 - sure) * weights, covered, half))
         rim_mean, _ = _mean(rim, weights, half)
+        rim_mean = np.maximum(rim_mean, 0.0)  # the rounding of its sums may leave less than 0
         for _ in range(2):
             around, _ = _mean(modest, quiet * weights, wide)
             # scale differences to the noise of a whole window
