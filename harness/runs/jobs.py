@@ -9,13 +9,10 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 from harness.vocabulary import system
 from harness.vocabulary.errors import DiskFull, UserError
-
-if TYPE_CHECKING:
-    from harness.records.examples import ExampleCloud, MappedExample
 
 State = Literal["done", "failed", "crashed", "timed out", "skipped"]
 """The ends of a job. Failed: it raised; crashed: its process died; skipped: something that it
@@ -124,7 +121,6 @@ class Outcome:
     finished: list[str] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     thresholds: dict[str, float] = field(default_factory=dict)
-    examples: list[ExampleCloud | MappedExample] = field(default_factory=list)
     renders: StageCounts = field(default_factory=StageCounts)
     trials: StageCounts = field(default_factory=StageCounts)
     peak_mb: float = 0.0

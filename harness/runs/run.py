@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from harness.records.examples import ExampleCloud, MappedExample
 from harness.runs.calibration import Calibration, Quiet, refiled
 from harness.runs.job_batches import (
     failure_of,
@@ -43,8 +44,7 @@ def run_plan(
     shard: Shard = WHOLE,
     retry_failed: bool = False,
 ) -> Outcome:
-    """Run the trials that the journal lacks (with ``retry_failed``, also those that failed), and
-    draw a whole sweep's pictures.
+    """Run the trials that the journal lacks (with ``retry_failed``, also those that failed).
 
     A job that fails becomes a `Failure`; trials that need it are skipped. Raises UserError if
     nothing can be written or the engine is gone. KeyboardInterrupt passes through; the journal has
@@ -73,23 +73,23 @@ def run_plan(
         journal.sync()
     if outcome.trials.over != outcome.trials.total:
         raise RuntimeError(f"trials were lost: {outcome.trials}")
-    if shard.is_whole:
-        _draw(plan, outcome, engine, run.rendered)
     outcome.finished.sort()
     outcome.failures.sort(key=lambda failure: failure.what)
     return outcome
 
 
-def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, rendered: set[Path]) -> None:
-    """Add the pictures of all judged groups, except in studies, whose limits determine which
-    boards are shown."""
+def examples_of(
+    plan: SweepPlan, outcome: Outcome, engine: JobEngine
+) -> list[ExampleCloud | MappedExample]:
+    """Draw the pictures of all judged groups, except in studies, whose limits determine which
+    boards are shown. What fails is added to the outcome."""
     groups = []
     for group in plan.groups:
         is_judged = any(point.digest in outcome.thresholds for point in group.points)
         if group.damaged.board is None and is_judged:
             groups.append(group)
     renders = [render for group in groups for render in group.damaged.renders]
-    failures = render_missing((job for job in renders if job.path not in rendered), engine)
+    failures = render_missing(renders, engine)
     outcome.failures += failures
     lost_views = {failure.what for failure in failures}
     jobs = []
@@ -97,7 +97,9 @@ def _draw(plan: SweepPlan, outcome: Outcome, engine: JobEngine, rendered: set[Pa
         if not any(lost_view(path.name) in lost_views for path in group.damaged.paths):
             arguments = (group, outcome.thresholds)
             jobs.append(Job(f"pictures of set-up {number}", "trials", pictures_of, arguments))
-    outcome.examples += pictures_from(jobs, engine, outcome)
+    examples = list(pictures_from(jobs, engine, outcome))
+    outcome.failures.sort(key=lambda failure: failure.what)
+    return examples
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ class _Run:
 
         # views
         self._renders = {render.path: render for render in plan.renders}
-        self.rendered: set[Path] = set()
+        self._rendered: set[Path] = set()
         """Files of views that are in the cache."""
         self._lost: dict[Path, str] = {}
         """The reasons why views could not be rendered."""
@@ -264,7 +266,7 @@ class _Run:
         missing = [trial for trial in self._trials(part) if not self._take_from_journal(trial)]
         if not missing:
             return
-        absent = [path for path in part.batch.paths if path not in self.rendered]
+        absent = [path for path in part.batch.paths if path not in self._rendered]
         for path in absent:
             self._request(path)
         lost = [self._lost[path] for path in absent if path in self._lost]
@@ -350,9 +352,9 @@ class _Run:
             else:
                 counts.done += 1
                 counts.seconds += seconds
-            self.rendered.add(path)
+            self._rendered.add(path)
             for part, trials in waiting:
-                if self.rendered.issuperset(part.batch.paths):
+                if self._rendered.issuperset(part.batch.paths):
                     self._queue += trials
             return
         counts.failed += 1

@@ -15,7 +15,7 @@ from harness.evaluation.study.result import evaluate_study
 from harness.experiment.digests import experiment_digests
 from harness.experiment.load import resolved_yaml
 from harness.experiment.schema import Experiment
-from harness.records.examples import StudyExample
+from harness.records.examples import ExampleCloud, MappedExample, StudyExample
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
 from harness.report.claims import claim_set_of
@@ -40,7 +40,7 @@ from harness.runs.pictures import (
 from harness.runs.plan import SweepPlan
 from harness.runs.precision import Batches, refuse_shard
 from harness.runs.results_folder import point_to
-from harness.runs.run import run_plan
+from harness.runs.run import examples_of, run_plan
 from harness.runs.shards import Shard, locked
 from harness.runs.study_record import failures_by_point, record_of, without_limit
 from harness.runs.tables import tables_of, write_tables
@@ -133,7 +133,8 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
                     origin=origin,
                     began=began,
                 )
-                written.store(shown)
+                if not outcome.failures:  # what failed may succeed the next time
+                    written.store(shown)
         if options.cache_limit_gb is not None:
             limit_bytes = round(options.cache_limit_gb * 1e9)
             trim_cache(cache, limit_bytes, keep=[render.path for render in plan.renders])
@@ -193,7 +194,8 @@ def _write_results(
     # a page calls it when its figures are drawn
     provenance[BILL] = engine.bill.rounded
     if experiment.config.study is None:
-        answer = _write_report(folder, experiment, outcome, tables, provenance)
+        examples = examples_of(plan, outcome, engine)
+        answer = _write_report(folder, experiment, examples, tables, provenance)
     else:
         answer = _write_study(
             folder,
@@ -297,19 +299,19 @@ def title_of(experiment: Experiment) -> str:
 def _write_report(
     folder: Path,
     experiment: Experiment,
-    outcome: Outcome,
+    examples: Sequence[ExampleCloud | MappedExample],
     tables: ResultTables,
     provenance: dict[str, Any],
 ) -> list[str | Grid]:
     """Write the summaries and the report of an experiment that is not a study. Return what the
     terminal shows."""
     facts = experiment.data
-    summary_tables = summaries(tables, outcome.examples, claim_set_of(facts))
+    summary_tables = summaries(tables, examples, claim_set_of(facts))
     write_tables(folder, as_files(summary_tables), provenance)
     write_report(
         folder,
         tables,
-        outcome.examples,
+        examples,
         provenance,
         resolved_yaml(experiment),
         title_of(experiment),

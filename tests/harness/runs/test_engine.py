@@ -11,14 +11,14 @@ import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from harness.experiment.load import load_experiment
-from harness.runs import run
+from harness.runs import run, study
 from harness.runs.jobs import Ended
 from harness.runs.journal import Journal, record_text
 from harness.runs.options import EngineOptions
@@ -125,6 +125,30 @@ def test_one_process_gives_the_same_numbers(finished, monkeypatch, tmp_path):
 
 
 @pytest.mark.usefixtures("unsaved")
+def test_a_finished_sweep_draws_no_pictures(finished, monkeypatch, tmp_path):
+    """Where its page is as it was; otherwise they are drawn for it."""
+    out = tmp_path / "out"
+    shutil.copytree(finished, out, symlinks=True)
+    drawn = []
+
+    def watched(*arguments: Any) -> Any:
+        drawn.append(arguments)
+        return examples_of(*arguments)
+
+    examples_of = study.examples_of
+    monkeypatch.setattr(study, "examples_of", watched)
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    serial = EngineOptions(serial=True)
+    page = results(out) / "report.html"
+    page.unlink()
+    assert study.run_study(experiment, out, serial, "again") == 0
+    assert len(drawn) == 1
+    again = page.read_text()
+    assert study.run_study(experiment, out, serial, "again") == 0
+    assert len(drawn) == 1
+    assert page.read_text() == again
+
+
 def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     half = tmp_path / "half"
     shutil.copytree(finished, half)
