@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from detectors.interface import Detection
-from detectors.methods import local_reference
+from detectors.methods import local, local_reference
 from detectors.methods.local import (
     LocalConfig,
     LocalDetector,
@@ -325,6 +325,38 @@ def test_the_narrowest_mean_needs_no_confirmation() -> None:
     around = np.array([[1.0, -1.0], [2.9, -2.9]])
     deviations = np.full((2, 2), 0.25)
     np.testing.assert_allclose(_strongest(means, around, deviations), [8.0, -8.0], rtol=1e-6)
+
+
+def rough_rim() -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (r, c) in metres of white noise that is twice as large on the three outermost
+    pixels, and which pixels (r, c) these are."""
+    noise_m = NOISE_M * np.random.default_rng(3).standard_normal((120, 160))
+    is_rim = np.ones(noise_m.shape, bool)
+    is_rim[3:-3, 3:-3] = False
+    noise_m[is_rim] *= 2.0
+    return noise_m, is_rim
+
+
+def test_errors_of_a_rim_are_not_averaged_out() -> None:
+    """Errors of an edge may be alike along it, so that the variance of a rim stays in every mean.
+    Without it, this rim's highest score is 5.2, above all others."""
+    noise_m, is_rim = rough_rim()
+    weights = np.ones(noise_m.shape, np.float32)
+    signed, _, _ = _scored(noise_m, weights, (0.0, 1e-10), reach_px=4.0)
+    assert 1.0 < np.abs(signed[is_rim]).max() < 3.0
+    assert 3.5 < np.abs(signed[~is_rim]).max() < 5.0
+
+
+def test_what_rounding_leaves_of_a_rim_is_no_variance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Running sums may leave a mean of rims slightly below 0 where there is none."""
+    noise_m, is_rim = rough_rim()
+    weights = np.ones(noise_m.shape, np.float32)
+    signed = []
+    for left in (0.0, -1e-12):
+        of_rims = np.full(noise_m.shape, left, np.float32)
+        monkeypatch.setattr(local, "_rim_variances", lambda *args, of_rims=of_rims: of_rims)
+        signed.append(_scored(noise_m, weights, (0.0, 1e-10), reach_px=4.0)[0])
+    np.testing.assert_array_equal(signed[0], signed[1])
 
 
 @pytest.mark.parametrize("width", [3, 7, 55])
