@@ -126,17 +126,14 @@ def _first_hits(
         reciprocal = (_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2]))
         is_oblique = reciprocal[0] != 0.0 and reciprocal[1] != 0.0 and reciprocal[2] != 0.0
         nearest = np.inf
-        waiting[0] = 0
-        waits_at[0] = 0.0
-        size = 1
-        while size > 0:
-            size -= 1
+        size = _begin(waiting, waits_at)
+        while True:
+            size = _still_waiting(waits_at, size, nearest) - 1
+            if size < 0:
+                break
             node = waiting[size]
-            if waits_at[size] > nearest:
-                continue
             if node >= len(boxes):
-                begin = (node - len(boxes)) * LEAF
-                for j in range(begin, min(begin + LEAF, len(corners))):
+                for j in _triangles_of(node, boxes, corners):
                     distance, u, v = _met(corners, j, origin, direction)
                     is_first = distance == nearest and numbers[j] < first[i]
                     if distance < nearest or (is_first and distance < np.inf):
@@ -165,6 +162,30 @@ def _row(places: np.ndarray, i: int) -> Vector:
 def _corner(corners: np.ndarray, j: int, number: int) -> Vector:
     """Return a corner of one of triangles (m, 3, 3)."""
     return corners[j, number, 0], corners[j, number, 1], corners[j, number, 2]
+
+
+@numba.njit(inline="always", **PLAIN)
+def _begin(waiting: np.ndarray, waits_at: np.ndarray) -> int:
+    """Let the root alone wait. Return how many nodes then wait."""
+    waiting[0] = 0
+    waits_at[0] = 0.0
+    return 1
+
+
+@numba.njit(inline="always", **PLAIN)
+def _still_waiting(waits_at: np.ndarray, size: int, farthest: float) -> int:
+    """Return how many of ``size`` nodes wait once those at the end that are farther than
+    ``farthest`` are dropped."""
+    while size > 0 and waits_at[size - 1] > farthest:
+        size -= 1
+    return size
+
+
+@numba.njit(inline="always", **PLAIN)
+def _triangles_of(leaf: int, boxes: np.ndarray, corners: np.ndarray) -> range:
+    """Return the places of a leaf's triangles in the tree."""
+    first = (leaf - len(boxes)) * LEAF
+    return range(first, min(first + LEAF, len(corners)))
 
 
 @numba.njit(inline="always", **PLAIN)
@@ -323,17 +344,14 @@ def _closest_within(
     closest = -1
     foot = (0.0, 0.0, 0.0)
     nearest = farthest
-    waiting[0] = 0
-    waits_at[0] = 0.0
-    size = 1
-    while size > 0:
-        size -= 1
+    size = _begin(waiting, waits_at)
+    while True:
+        size = _still_waiting(waits_at, size, nearest) - 1
+        if size < 0:
+            break
         node = waiting[size]
-        if waits_at[size] > nearest:
-            continue
         if node >= len(boxes):
-            begin = (node - len(boxes)) * LEAF
-            for j in range(begin, min(begin + LEAF, len(corners))):
+            for j in _triangles_of(node, boxes, corners):
                 place = _closest(corners, j, point)
                 square = _square_off(place, point)
                 is_first = square == nearest and (closest < 0 or numbers[j] < closest)
