@@ -349,7 +349,7 @@ def test_errors_of_a_rim_are_not_averaged_out() -> None:
 
 def test_what_rounding_leaves_of_a_rim_is_no_variance(monkeypatch: pytest.MonkeyPatch) -> None:
     """Running sums may leave a mean of rims slightly below 0 where there is none."""
-    noise_m, is_rim = rough_rim()
+    noise_m, _ = rough_rim()
     weights = np.ones(noise_m.shape, np.float32)
     signed = []
     for left in (0.0, -1e-12):
