@@ -28,8 +28,8 @@ def group_medians(
     for g in range(groups):
         if starts[g + 1] > starts[g]:
             members = grouped[starts[g] : starts[g + 1]]
-            medians[g] = median_sorted(members)
-            deviations[g] = median_sorted(np.abs(members - medians[g])) / 0.6745
+            medians[g] = median_of_few(members)
+            deviations[g] = median_of_few(np.abs(members - medians[g])) / 0.6745
     return medians, deviations
 
 
@@ -40,24 +40,38 @@ def row_medians(rows: np.ndarray) -> np.ndarray:
     for n in range(len(rows)):
         values = rows[n][np.isfinite(rows[n])]
         if len(values):
-            medians[n] = median_sorted(values)
+            medians[n] = median_of_few(values)
     return medians
 
 
 @numba.njit(cache=True, nogil=True)
-def median_sorted(values: np.ndarray) -> float:
-    """Return the median of values (n,), which it sorts (Shell 1959): numba's own takes 2 s longer
-    to compile."""
-    gap = len(values) // 2
-    while gap > 0:
-        for i in range(gap, len(values)):
-            value = values[i]
-            j = i
-            while j >= gap and values[j - gap] > value:
-                values[j] = values[j - gap]
-                j -= gap
-            values[j] = value
-        gap //= 2
-    lower = values[(len(values) - 1) // 2]
-    upper = values[len(values) // 2]
-    return 0.5 * (lower + upper)
+def median_of_few(values: np.ndarray) -> float:
+    """Return the median of values (n,), n >= 1, which it reorders until none before the middle is
+    larger and none after it is smaller (Hoare 1961): numba's own takes 2 s longer to compile."""
+    middle = len(values) // 2
+    first = 0
+    last = len(values) - 1
+    while first < last:
+        pivot = values[middle]
+        low = first
+        high = last
+        while low <= high:
+            while values[low] < pivot:
+                low += 1
+            while values[high] > pivot:
+                high -= 1
+            if low <= high:
+                swapped = values[low]
+                values[low] = values[high]
+                values[high] = swapped
+                low += 1
+                high -= 1
+        # the middle lies in one of the two parts, or between them in its place
+        if high < middle:
+            first = low
+        if low > middle:
+            last = high
+    upper = values[middle]
+    if len(values) % 2:
+        return upper
+    return 0.5 * (values[:middle].max() + upper)
