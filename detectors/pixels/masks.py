@@ -1,8 +1,11 @@
 """Operations on masks (h, w) bool: enclosed areas, rims, connected parts and nearest pixels."""
 
 import cv2
+import numba
 import numpy as np
 from scipy import ndimage
+
+from detectors.pixels.clusters import PLAIN, root_of
 
 
 def on_grid(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -135,15 +138,60 @@ def components(
     """Number the sets of nodes (h, w) that links join, largest first; return the numbers (h, w)
     and the sizes. ``right`` and ``down`` (h, w) bool: whether a pixel is linked to the next in its
     row and in its column."""
-    # links are pixels between those of the nodes
-    spread = np.zeros(np.multiply(nodes.shape, 2) - 1, np.uint8)
-    spread[::2, ::2] = nodes
-    spread[::2, 1::2] = right[:, :-1] & nodes[:, :-1] & nodes[:, 1:]
-    spread[1::2, ::2] = down[:-1] & nodes[:-1] & nodes[1:]
-    _, labels = cv2.connectedComponents(spread, connectivity=4)
-    labels = labels[::2, ::2]
-    sizes = np.bincount(labels.ravel())[1:]
+    sets, sizes = _sets_of_nodes(nodes, right, down)
     order = np.argsort(-sizes, kind="stable")
     number = np.zeros(len(sizes) + 1, dtype=np.int32)
     number[order + 1] = np.arange(1, len(sizes) + 1)
-    return number[labels], sizes[order]
+    return number[sets], sizes[order]
+
+
+@numba.njit(**PLAIN)
+def _sets_of_nodes(
+    nodes: np.ndarray, right: np.ndarray, down: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number (h, w) of each node's set, from 1 in the order of their first pixels, 0
+    beside nodes, and the sets' sizes.
+
+    A node takes the number of the node on its left or above it; where it joins two numbers, the
+    higher one gets the lower one as its parent."""
+    height, width = nodes.shape
+    sets = np.zeros((height, width), np.int32)
+    parents = np.zeros(height * width + 1, np.int64)
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            if not nodes[v, u]:
+                continue
+            beside = 0
+            if u > 0 and right[v, u - 1]:
+                beside = sets[v, u - 1]
+            above = 0
+            if v > 0 and down[v - 1, u]:
+                above = sets[v - 1, u]
+            if beside == 0 and above == 0:
+                count += 1
+                parents[count] = count
+                sets[v, u] = count
+            elif beside == 0 or above == 0 or beside == above:
+                sets[v, u] = max(beside, above)
+            else:
+                first = root_of(parents, beside)
+                second = root_of(parents, above)
+                parents[max(first, second)] = min(first, second)
+                sets[v, u] = min(first, second)
+    # parents have lower numbers, so that each one's final number is known before its children's
+    final = np.zeros(count + 1, np.int32)
+    sizes = np.zeros(count + 1, np.int64)
+    kept = 0
+    for number in range(1, count + 1):
+        if parents[number] == number:
+            kept += 1
+            final[number] = kept
+        else:
+            final[number] = final[parents[number]]
+    for v in range(height):
+        for u in range(width):
+            number = final[sets[v, u]]
+            sets[v, u] = number
+            sizes[number] += 1
+    return sets, sizes[1 : kept + 1]
