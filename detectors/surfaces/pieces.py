@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from detectors.pixels.masks import nearest_pixel
+from detectors.pixels.noise import sigma_of
 from detectors.surfaces.surface import SurfaceFunction, bisquare_weights, polynomial
 
 MOST_SAMPLES = 4000  # points from which a piece's surface is fitted
@@ -66,7 +67,7 @@ def _sample(mask: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     pixels = np.flatnonzero(mask)
     step = max(1, len(pixels) // MOST_SAMPLES)
     points = points_m.reshape(-1, 3)[pixels[::step]]
-    return points[np.isfinite(points).all(axis=1)]
+    return points[np.isfinite(points[:, 2])]
 
 
 def _fitted(points: np.ndarray) -> tuple[SurfaceFunction, float]:
@@ -76,7 +77,7 @@ def _fitted(points: np.ndarray) -> tuple[SurfaceFunction, float]:
     for _ in range(3):
         fit = polynomial(points, weights, degree=2)
         off_m = points[:, 2] - fit(points)
-        scale_m = max(float(np.median(np.abs(off_m))) / 0.6745, 1e-6)
+        scale_m = max(sigma_of(off_m), 1e-6)
         weights = bisquare_weights(off_m, 6.0 * scale_m)
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)

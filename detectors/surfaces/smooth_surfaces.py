@@ -337,14 +337,24 @@ def unit_normals(surface_m: np.ndarray) -> np.ndarray:
     return normals
 
 
+@numba.njit(**PLAIN)
 def turns(normals: np.ndarray, half: int, least_cosine: float) -> np.ndarray:
-    """Return (h, w) bool: whether the unit normals ``half`` pixels to either side enclose a wider
-    angle."""
-    turned = np.zeros(normals.shape[:2], dtype=bool)
-    down = np.einsum("ijk,ijk->ij", normals[2 * half :], normals[: -2 * half])
-    turned[half:-half] |= down < least_cosine
-    across = np.einsum("ijk,ijk->ij", normals[:, 2 * half :], normals[:, : -2 * half])
-    turned[:, half:-half] |= across < least_cosine
+    """Return (h, w) bool: whether the unit normals (h, w, 3) ``half`` pixels to either side
+    enclose a wider angle, along a column or along a row."""
+    h, w, _ = normals.shape
+    turned = np.zeros((h, w), np.bool_)
+    for v in range(h):
+        for u in range(w):
+            if half <= v < h - half:
+                above = normals[v - half, u]
+                below = normals[v + half, u]
+                cosine = above[0] * below[0] + above[1] * below[1] + above[2] * below[2]
+                turned[v, u] = cosine < least_cosine
+            if half <= u < w - half:
+                before = normals[v, u - half]
+                after = normals[v, u + half]
+                cosine = before[0] * after[0] + before[1] * after[1] + before[2] * after[2]
+                turned[v, u] |= cosine < least_cosine
     return turned
 
 
