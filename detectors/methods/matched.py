@@ -47,6 +47,7 @@ from detectors.methods.local import FilterConfig, LocalDetector, LocalEvidence, 
 from detectors.methods.scatter import WIDE_PX
 from detectors.methods.template_scores import PictureNoise, scored, template_noise
 from detectors.pixels.masks import grown
+from detectors.pixels.noise import median_of
 from harness.vocabulary.geometry import Cloud
 
 # --- single pixels ---
@@ -155,7 +156,7 @@ class MatchedDetector(LocalDetector):
             rim = rim_of(residuals, covariance, reach_px, is_alone=True)
         tamed = _tamed(residuals.values) if self._clips else residuals.values
         signed, narrowest = _judged(residuals, tamed, covariance, rim)
-        depth_m = narrowest * float(np.median(residuals.unit_m[residuals.is_known]))
+        depth_m = narrowest * median_of(residuals.unit_m[residuals.is_known])
         unit = (
             f"the deviation of matched filters on whitened noise, {1e3 * depth_m:.3g} mm for the"
             " narrowest"

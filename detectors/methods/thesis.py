@@ -70,7 +70,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
             score=on_grid(np.abs(residual_m) / scale_m, mask),
             residual_m=on_grid(residual_m, mask),
             surface_z_m=on_grid(fitted, mask),
-            scale_m=float(np.median(scale_m)),
+            scale_m=median_of(scale_m),
             notes={
                 "surface": surface.note,
                 "points": len(z),
