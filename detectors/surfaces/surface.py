@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from detectors.pixels.clusters import PLAIN
 from detectors.pixels.noise import median_of
-from detectors.surfaces.interior_point import least_absolute
+from detectors.surfaces.interior_point import least_absolute_of_many
 from harness.vocabulary.config import Config
 from harness.vocabulary.errors import UserError
 
@@ -277,7 +277,7 @@ def _lar(
         solution = _smoothed(basis, z, c, knees[2:], margin)
     if solution is not None:
         return solution
-    c, gap = least_absolute(basis, z, c, GAP_CONVERGED)
+    c, gap = least_absolute_of_many(basis, z, c, GAP_CONVERGED)
     return c, _lar_note(gap)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import linprog
 
 from detectors.surfaces import interior_point, surface
-from detectors.surfaces.interior_point import least_absolute
+from detectors.surfaces.interior_point import least_absolute, least_absolute_of_many
 from detectors.surfaces.surface import Chebyshev, SurfaceConfig, fit_surface
 
 TERMS = 10
@@ -54,6 +54,50 @@ def test_points_that_lie_on_a_surface_are_solved_at_once() -> None:
     c, reached = least_absolute(basis, truth @ basis, truth, 1e-6)
     assert np.array_equal(c, truth)
     assert reached <= 1e-6
+
+
+def many_points(columns: int = 200, rows: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the products (p, n) of a drilled plate, z (n,), and the solution (p,) of every eighth
+    point."""
+    points = drilled_plate(columns, rows)
+    basis = Chebyshev.over(points[:, :2], degree=3).basis(points[:, :2])
+    z = points[:, 2]
+    start, _ = least_absolute(basis[:, ::8], z[::8], np.zeros(TERMS), 1e-6)
+    return basis, z, start
+
+
+@pytest.mark.parametrize("rounds", [interior_point.MOST_ROUNDS, 0])
+def test_points_on_one_side_that_count_as_one_leave_the_least_sum(monkeypatch, rounds: int) -> None:
+    """Also where all have to be solved for at last."""
+    basis, z, start = many_points()
+    monkeypatch.setattr(interior_point, "MOST_ROUNDS", rounds)
+    expected, _ = least_absolute(basis, z, start, 1e-7)
+    c, reached = least_absolute_of_many(basis, z, start, 1e-6)
+    excess = np.abs(z - c @ basis).sum() / np.abs(z - expected @ basis).sum() - 1
+    assert -1e-7 < excess <= reached + 1e-7
+    assert reached <= 1e-6
+
+
+def test_few_of_many_points_are_solved_for_one_by_one(monkeypatch) -> None:
+    """Those on a wrong side of the first surface are solved for then: a fifth suffices."""
+    basis, z, start = many_points(400, 300)
+    solved_for = []
+
+    def counting(few_basis: np.ndarray, *arguments: object) -> object:
+        solved_for.append(few_basis.shape[1] / len(z))
+        return least_absolute(few_basis, *arguments)
+
+    monkeypatch.setattr(interior_point, "least_absolute", counting)
+    least_absolute_of_many(basis, z, start, 1e-6)
+    assert 1 < len(solved_for) <= interior_point.MOST_ROUNDS
+    assert max(solved_for) < 0.2
+
+
+def test_leverages_are_those_of_the_projection() -> None:
+    basis, _, _ = many_points()
+    few = basis[:, :300]
+    projection = few.T @ np.linalg.solve(few @ few.T, few)
+    np.testing.assert_allclose(interior_point._leverage(few), projection.diagonal(), rtol=1e-3)
 
 
 def test_few_points_far_away_cost_hundreds_of_steps_not_thousands(monkeypatch) -> None:
