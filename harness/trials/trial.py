@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from harness.records.rows import Origin, Role, TrialRecord
 from harness.trials.averages import Averaging, averages_of
@@ -108,25 +109,50 @@ def sharing_averages(points: Sequence[TrialPoint]) -> list[list[TrialPoint]]:
     return list(groups.values())
 
 
+Averages = Sequence[Mapping[int, Cloud]]
+"""Clouds by view, then by number of frames."""
+
+_kept: dict[tuple[Any, ...], Averages] = {}
+"""The averages of the last hole-free board, by all that determines them."""
+
+
 def captured(
     trial: Trial, boards: Sequence[Board], points: Sequence[TrialPoint]
 ) -> ViewClouds | MapClouds:
     """Capture and average the frames of each view at all numbers of frames of the points, which
-    share their averaging."""
+    share their averaging.
+
+    Set-ups that differ only in their damage see the same hole-free board one after the other, so
+    its averages are kept for the next trial, with what detectors have fitted to them."""
+    averaging = points[0].averaging
+    counts = []
+    for number in range(len(boards)):
+        counts.append(sorted({point.frames for point in points if uses_view(point, number)}))
+    if not trial.hole_free or trial.board is not None:
+        return clouds_of(trial, boards, _averages(trial, boards, counts, averaging))
+    shown = [(view.view_path, view.camera) for view in trial.views]
+    key = (*shown, trial.seed, trial.labels, averaging, repr(counts))
+    if key not in _kept:
+        _kept.clear()
+        _kept[key] = _averages(trial, boards, counts, averaging)
+    return clouds_of(trial, boards, _kept[key])
+
+
+def _averages(
+    trial: Trial, boards: Sequence[Board], counts: Sequence[Sequence[int]], averaging: Averaging
+) -> Averages:
+    """Capture and average the frames of each view at its numbers of frames (``counts``)."""
     averages = []
     for number, board in enumerate(boards):
-        counts = sorted({point.frames for point in points if uses_view(point, number)})
         clouds: dict[int, Cloud] = {}
-        if counts:
-            capture = capture_of(trial, number, board, counts[-1])
-            clouds = averages_of(capture, counts, points[0].averaging)
+        if counts[number]:
+            capture = capture_of(trial, number, board, counts[number][-1])
+            clouds = averages_of(capture, counts[number], averaging)
         averages.append(clouds)
-    return clouds_of(trial, boards, averages)
+    return averages
 
 
-def clouds_of(
-    trial: Trial, boards: Sequence[Board], averages: Sequence[Mapping[int, Cloud]]
-) -> ViewClouds | MapClouds:
+def clouds_of(trial: Trial, boards: Sequence[Board], averages: Averages) -> ViewClouds | MapClouds:
     """Return what points see of averages by view and number of frames."""
     if trial.poses is not None:
         return MapClouds(boards, averages, trial.poses, trial.labels)

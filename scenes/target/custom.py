@@ -503,7 +503,7 @@ class TargetConfig(SetUpConfig):
 
     def hole_free(self) -> TargetConfig:
         """Return the same set-up without any damage; a threshold is calibrated on it."""
-        return self.model_copy(update={"holes": (), "dents": (), "flaws": ()})
+        return self.model_copy(update={"drill": None, "holes": (), "dents": (), "flaws": ()})
 
     def at_wavelength(self, wavelength_nm: float) -> TargetConfig:
         """Return the declaration with the nearest albedos to that wavelength as its

@@ -11,6 +11,7 @@ import pytest
 
 from detectors.views.mapping.settings import MappingConfig
 from harness.records.rows import TrialRecord
+from harness.trials import board as boards
 from harness.trials import trial as trials
 from harness.trials.board import Board
 from harness.trials.judge import Criteria, Judgement, LabelledCloud, judge
@@ -126,6 +127,50 @@ def test_a_hole_free_board_shows_noise_and_errors(hole_free: Board) -> None:
     cloud = cloud_of(trial_before(hole_free), point_of())
     expected_mm = (cloud.points_m[..., 2].ravel()[hole_free.probes] - DISTANCE_M) / MM
     np.testing.assert_allclose(errors_mm, expected_mm, atol=1e-4)
+
+
+def test_set_ups_that_differ_in_their_damage_share_a_hole_free_board(
+    hole_free: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are drawn again for other noise, for more of them and for another view, but not for
+    another damage that is not shown."""
+    drawn = []
+
+    def counting(trial: Trial, *arguments: Any) -> Any:
+        drawn.append(trial)
+        return drawing(trial, *arguments)
+
+    drawing = trials._averages
+    monkeypatch.setattr(trials, "_averages", counting)
+    monkeypatch.setattr(trials, "_kept", {})
+    first = trial_before(hole_free)
+    (view,) = first.views
+    alike = replace(view, target=view.target.model_copy(update={"holes": ()}))
+    another = replace(view, view_path="another")
+    other_unit = replace(view, camera=view.camera.model_copy(update={"unit_seed": 2}))
+    for shown in (alike, another, other_unit):
+        monkeypatch.setitem(boards._kept, shown, hole_free)
+    record = run_trial(first)
+    again = run_trial(replace(first, views=(alike,), points=(point_of(threshold=7.0),)))
+    assert drawn == [first]
+    assert again.runs[0].quiet_threshold == record.runs[0].quiet_threshold
+    assert again.probes == record.probes
+    others = (
+        replace(first, seed=6),
+        replace(first, repeat=4),
+        replace(first, points=(replace(point_of(), frames=6),)),
+        replace(first, views=(another,)),
+        replace(first, views=(other_unit,)),
+        replace(first, board=1),
+    )
+    for other in others:
+        drawn.clear()
+        run_trial(first)
+        run_trial(other)
+        assert drawn[-1] == other
+    # boards of studies are not kept
+    run_trial(others[-1])
+    assert drawn[-2:] == [others[-1], others[-1]]
 
 
 def test_points_that_see_and_judge_alike_share_the_judgement(

@@ -72,10 +72,13 @@ def test_plain_data_round_trip() -> None:
 
 
 def test_hole_free_keeps_everything_else() -> None:
-    config = custom(holes=[{"id": 1, "diameter_mm": 5, "centre_mm": [0, 0]}])
+    hole = {"id": 1, "centre_mm": [0, 0]}
+    config = custom(holes=[{**hole, "diameter_mm": 5}])
     bare = config.hole_free()
     assert bare.damages == ()
     assert bare == custom()
+    # all drills leave the same board
+    assert custom(holes=[hole], drill={"diameter_mm": 6}).hole_free() == bare
     assert config.declare() is config
 
 
