@@ -268,11 +268,7 @@ def load_board(ref: BoardRef) -> Board:
 
 
 def _loaded(ref: BoardRef) -> Board:
-    view = read_view(Path(ref.view_path))
-    if view is None:
-        what = f"{ref.view_path}: the stored render is missing or damaged"
-        raise UserError(what, fix="run the same command again")
-    unit = SimulatedUnit(camera_of(ref.camera), ref.camera, view)
+    unit = _unit_before(ref)
     T_camera_board = ref.target.pose.T_camera_board
     truth = truth_of(ref.target, T_camera_board)
     centres_m = np.array([damage.centre_camera_m for damage in truth]).reshape(-1, 3)
@@ -284,6 +280,19 @@ def _loaded(ref: BoardRef) -> Board:
         target=ref.target,
         T_camera_board=T_camera_board,
     )
+
+
+def _unit_before(ref: BoardRef) -> SimulatedUnit:
+    """Return the unit of a reference's camera before its view: that of a board in memory which
+    shows the same, so that both share the exposure, or a new one."""
+    for kept_ref, board in _kept.items():
+        if kept_ref.view_path == ref.view_path and kept_ref.camera == ref.camera:
+            return board.unit
+    view = read_view(Path(ref.view_path))
+    if view is None:
+        what = f"{ref.view_path}: the stored render is missing or damaged"
+        raise UserError(what, fix="run the same command again")
+    return SimulatedUnit(camera_of(ref.camera), ref.camera, view)
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,24 @@ def test_places_far_from_all_damage() -> None:
     assert far_from((), places_m, 0.002).all()
 
 
+def test_boards_that_a_view_shows_alike_share_the_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that is not damaged shows nothing of the damage that was left out."""
+    shown = board_of(damaged=False)
+    monkeypatch.setattr(boards, "_kept", type(boards._kept)())
+    ref = reference_of(shown)
+    data = ref.target.to_data()
+    wider = TargetConfig.from_data({**data, "holes": [{**data["holes"][0], "diameter_mm": 30.0}]})
+    other = load_board(replace(ref, target=wider))
+    assert other.unit is shown.unit
+    assert [damage.diameter_m for damage in other.truth] == [0.030]
+    read = []
+    monkeypatch.setattr(boards, "read_view", lambda path: read.append(path) or shown.unit.view)
+    other_camera = ref.camera.model_copy(update={"unit_seed": 2})
+    assert load_board(replace(ref, camera=other_camera)).unit.config == other_camera
+    assert load_board(replace(ref, view_path="another")).unit is not shown.unit
+    assert len(read) == 2
+
+
 def test_boards_are_kept_up_to_a_number_and_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 
