@@ -134,7 +134,8 @@ class Group:
     """Points that share their frames: one set-up, one seed.
 
     Groups of a study that differ only in the damage have the same trials before thresholds. The
-    first such group is the ``leader`` of the others and runs these trials for all of them."""
+    first such group is the ``leader`` of the others and runs these trials for all of them, and
+    those of hole-free boards if these are the same too."""
 
     points: tuple[Point, ...]
     """The points, in the experiment's order."""
@@ -154,6 +155,11 @@ class Group:
     """Points of the groups that this group leads, in the same order as its own."""
     leader: Group | None = None
     """The group that runs the trials before thresholds; None: this group."""
+    sharing: tuple[Group, ...] = ()
+    """Groups that this group leads and whose hole-free boards show the same: their points are
+    judged in this group's trials."""
+    is_shared: bool = False
+    """Whether this group's hole-free boards are judged in its leader's trials."""
 
     @property
     def batches(self) -> tuple[Batch, ...]:
@@ -207,6 +213,8 @@ class Group:
         learns."""
         if batch.role == "learning":
             return len(self.learners)
+        if self.is_shared and batch.role == "hole_free":
+            return 0
         return max(self.repeats(batch, point) for point in self.points)
 
     def trials(
@@ -223,18 +231,23 @@ class Group:
             yield from self._learning_trials(batch, repeats)
             return
         points = []
-        for point in self._judging_points(batch):
+        for point, shown in self._judging_points(batch):
             threshold = point.config.threshold.k
             if thresholds is not None:
                 threshold = thresholds.get(point.digest, threshold)
             is_judged = thresholds is None or batch in self.first or threshold is not None
             if is_judged and point.digest not in without:
                 learned = self.learned.get(point.digest)
-                points.append((self.repeats(batch, point), trial_point(point, threshold, learned)))
+                judging = trial_point(point, threshold, learned)
+                points.append((self.repeats(batch, point), judging, shown))
         if repeats is None:
-            repeats = range(max((count for count, _ in points), default=0))
+            repeats = range(max((count for count, _, _ in points), default=0))
         for repeat in repeats:
-            judging = tuple(point for count, point in points if repeat < count)
+            judging = []
+            for count, point, shown in points:
+                if repeat < count:
+                    left_out = () if shown is batch else shown.before(repeat)
+                    judging.append(replace(point, left_out=left_out))
             if not judging:
                 continue
             trial = Trial(
@@ -242,7 +255,7 @@ class Group:
                 seed=self.seed,
                 role=batch.role,
                 repeat=repeat,
-                points=judging,
+                points=tuple(judging),
                 poses=self.poses,
                 board=batch.board,
                 references=batch.references_before(repeat),
@@ -266,11 +279,34 @@ class Group:
             )
             yield self._key(batch, trial), trial
 
-    def _judging_points(self, batch: Batch) -> tuple[Point, ...]:
-        """Return the points that judge a batch: before thresholds, also those of led groups."""
+    def _judging_points(self, batch: Batch) -> list[tuple[Point, Batch]]:
+        """Return the points that judge a batch, each with the batch that shows its own target:
+        before thresholds, also those of led groups, and on hole-free boards of those that share
+        them."""
         if batch in self.first:
-            return (*self.points, *self.also)
-        return self.points
+            return [(point, batch) for point in (*self.points, *self.also)]
+        if self.is_shared and batch.role == "hole_free":
+            return []
+        judging = [(point, batch) for point in self.points]
+        if batch.role == "hole_free":
+            for group in self.sharing:
+                (shown,) = [own for own in group.hole_free if own.board == batch.board]
+                judging += [(point, shown) for point in group.points]
+        return judging
+
+    @property
+    def hole_free(self) -> tuple[Batch, ...]:
+        """The hole-free batches that are judged."""
+        return tuple(batch for batch in self.then if batch.role == "hole_free")
+
+    def shows_the_same_hole_free(self, other: Group) -> bool:
+        """Return whether the hole-free boards that both groups of a study judge show the same in
+        one view, so that frames and findings are the same: their damage is left out."""
+        return (
+            self.poses is None
+            and bool(self.hole_free)
+            and _seen(self.hole_free) == _seen(other.hole_free)
+        )
 
     def _key(self, batch: Batch, trial: Trial) -> str:
         """Return a trial's key in the journal: its role and number, and a digest of everything
@@ -290,6 +326,15 @@ class Group:
         ]
         number = trial.repeat if trial.board is None else trial.board
         return f"{trial.role}-{number:05d}-{digest(content)}"
+
+
+def _seen(batches: Sequence[Batch]) -> list[tuple[Any, ...]]:
+    """Return what the cameras see of each batch, with its references."""
+    seen = []
+    for batch in batches:
+        cameras = [view.camera for view in batch.views]
+        seen.append((batch.board, batch.paths, cameras, batch.units, batch.references))
+    return seen
 
 
 def foreign_filters(trial: Trial) -> list[str]:
@@ -393,9 +438,13 @@ def plan_of(
     groups: list[Group] = []
     for leader, *followers in by_first_trials.values():
         also = tuple(point for group in followers for point in group.points)
-        leader = replace(leader, also=also)
+        sharing = tuple(group for group in followers if group.shows_the_same_hole_free(leader))
+        leader = replace(leader, also=also, sharing=sharing)
         groups.append(leader)
-        groups += [replace(group, learning=(), first=(), leader=leader) for group in followers]
+        for group in followers:
+            is_shared = group in sharing
+            led = replace(group, learning=(), first=(), leader=leader, is_shared=is_shared)
+            groups.append(led)
     return SweepPlan(tuple(groups), designs or {})
 
 

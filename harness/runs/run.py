@@ -63,8 +63,10 @@ def run_plan(
         run.take_learned()
         run.carry_out(part for part in before if part.batch.role != "learning")
         to_judge: list[PlanPart] = []
+        judging = {id(plan.groups[number]) for number, parts in enumerate(judged_parts) if parts}
         for number, parts in enumerate(judged_parts):
-            if parts:
+            group = plan.groups[number]
+            if parts or (group.is_shared and id(group.leader) in judging):
                 to_judge += run.calibrated(number, parts)
         run.carry_out(to_judge)
         while run.under_way:  # renders that no trial waits for

@@ -21,7 +21,7 @@ from detectors.views.view import PreparedView, View
 from harness.experiment.schema import AnyReference
 from harness.records.rows import NoiseRow, Origin, ProbesRow, RegistrationRow, Role
 from harness.trials.averages import Averaging
-from harness.trials.board import Board, LabelledCloud, face_errors_m
+from harness.trials.board import Board, BoardRef, LabelledCloud, face_errors_m, load_board
 from harness.trials.judge import Criteria, detector_of
 from harness.trials.references import Recorded, ReferenceBoards, compared
 from harness.vocabulary.geometry import MM, Cloud, invert, transform_points
@@ -54,6 +54,9 @@ class TrialPoint:
     """Registration and merge of the clouds of several views; None for a single view."""
     reference: AnyReference | None = None
     """What the cloud is compared with; None: a surface that is fitted to it."""
+    left_out: tuple[BoardRef, ...] = ()
+    """The hole-free board with the damage that the point's own set-up leaves out; empty: the
+    trial's."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,11 @@ class ViewClouds:
 
     def labelled(self, point: TrialPoint) -> LabelledCloud:
         """Return the cloud with the truth."""
-        return self.board.labelled(self.cloud(point))
+        board = self.board
+        if point.left_out:
+            (shown,) = point.left_out
+            board = load_board(shown)
+        return board.labelled(self.cloud(point))
 
     def probes_row(self, point: TrialPoint, origin: Origin) -> ProbesRow:
         """Return the errors of z at the board's probes."""

@@ -207,18 +207,52 @@ def analysed(labelled: LabelledCloud, criteria: Criteria) -> Judgement:
     quiet_threshold = np.nan
     if not labelled.damaged:
         quiet_threshold = detector.quiet_threshold(labelled.cloud, evidence)
-    surface_noise_m = np.nan
-    residual_m = evidence.residual_m[labelled.undamaged]
-    residual_m = residual_m[np.isfinite(residual_m)]
-    if residual_m.size:
-        surface_noise_m = sigma_of(residual_m - median_of(residual_m))
     return Judgement(
         labelled=labelled,
         criteria=criteria,
         detector=detector,
         evidence=evidence,
         quiet_threshold=quiet_threshold,
-        surface_noise_m=surface_noise_m,
+        surface_noise_m=_surface_noise_m(labelled, evidence),
+    )
+
+
+def _surface_noise_m(labelled: LabelledCloud, evidence: Evidence) -> float:
+    residual_m = evidence.residual_m[labelled.undamaged]
+    residual_m = residual_m[np.isfinite(residual_m)]
+    if not residual_m.size:
+        return np.nan
+    return sigma_of(residual_m - median_of(residual_m))
+
+
+def with_truth(judgement: Judgement, labelled: LabelledCloud) -> Judgement:
+    """Return the judgement of a hole-free board as one of the same cloud with other damage left
+    out: only what is compared with the truth changes."""
+    if labelled.damaged:
+        raise ValueError("a board with other damage shows something else")
+    judgement = replace(
+        judgement,
+        labelled=labelled,
+        surface_noise_m=_surface_noise_m(labelled, judgement.evidence),
+    )
+    if judgement.criteria.threshold is None:
+        return judgement
+    return _with_hits(judgement, judgement.detections)
+
+
+def _with_hits(judgement: Judgement, detections: tuple[Detection, ...]) -> Judgement:
+    """Place detections on the face, and match them to the damage."""
+    labelled = judgement.labelled
+    centres_m = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
+    hits, parts = matched(
+        labelled, detections, judgement.criteria.radius_m, judgement.criteria.overlap
+    )
+    return replace(
+        judgement,
+        detections=detections,
+        places_m=labelled.on_board(centres_m),
+        hits=hits,
+        parts=parts,
     )
 
 
@@ -227,25 +261,15 @@ def with_detections(judgement: Judgement, threshold: float) -> Judgement:
     labelled = judgement.labelled
     detector = judgement.detector
     detections = detector.find(labelled.cloud, judgement.evidence, threshold)
-    centres_m = np.array([detection.centre_m for detection in detections]).reshape(-1, 3)
-    hits, parts = matched(
-        labelled, detections, judgement.criteria.radius_m, judgement.criteria.overlap
-    )
+    judgement = _with_hits(judgement, detections)
     measurements = {}
     if labelled.damaged:
         # the hits, and the largest detection, relative to which the other places are given
-        for index in {*hits.values(), _largest(detections)} - {NONE}:
+        for index in {*judgement.hits.values(), _largest(detections)} - {NONE}:
             measurements[index] = detector.measure(
                 labelled.cloud, judgement.evidence, detections[index]
             )
-    return replace(
-        judgement,
-        detections=detections,
-        places_m=labelled.on_board(centres_m),
-        hits=hits,
-        parts=parts,
-        measurements=measurements,
-    )
+    return replace(judgement, measurements=measurements)
 
 
 NONE = -1  # index of no detection

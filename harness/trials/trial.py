@@ -16,7 +16,7 @@ from harness.records.rows import Origin, Role, TrialRecord
 from harness.trials.averages import Averaging, averages_of
 from harness.trials.board import Board, BoardRef, load_board
 from harness.trials.clouds import NOISE_FRAMES, MapClouds, TrialPoint, ViewClouds
-from harness.trials.judge import Criteria, Judgement, judge
+from harness.trials.judge import Criteria, Judgement, judge, with_truth
 from harness.trials.record import add_judgement
 from harness.trials.references import NO_REFERENCES, ReferenceBoards
 from harness.vocabulary.geometry import Cloud
@@ -75,9 +75,12 @@ def run_trial(trial: Trial) -> TrialRecord:
             if judged_as not in judgements:
                 labelled = clouds.labelled(point)
                 judgements[judged_as] = judge(labelled, point.criteria)
+            judgement = judgements[judged_as]
+            if point.left_out:
+                judgement = with_truth(judgement, clouds.labelled(point))
             add_judgement(
                 record,
-                judgements[judged_as],
+                judgement,
                 point=point.digest,
                 origin=origin,
                 role=trial.role,

@@ -198,6 +198,45 @@ def test_points_that_see_and_judge_alike_share_the_judgement(
     assert repr(alike) == repr(first)  # NaN differs from itself
 
 
+def test_points_that_leave_out_other_damage_share_frames_and_findings(
+    hole_free: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their rows are those of a trial of their own."""
+    judged = []
+
+    def counting(labelled: LabelledCloud, criteria: Criteria) -> Judgement:
+        judged.append(labelled)
+        return judge(labelled, criteria)
+
+    monkeypatch.setattr(trials, "judge", counting)
+    first = trial_before(hole_free, point_of("first", digest="1"), number=2)
+    (view,) = first.views
+    data = view.target.to_data()
+    wide_hole = {**data["holes"][0], "diameter_mm": 40.0, "centre_mm": [30.0, -20.0]}
+    elsewhere = replace(view, target=type(view.target).from_data({**data, "holes": [wide_hole]}))
+    for threshold in (3.0, None):
+        own = point_of("first", digest="1", threshold=threshold)
+        other = point_of("second", digest="2", threshold=threshold)
+        sharing = replace(other, left_out=(elsewhere,))
+        judged.clear()
+        joint = rows_of(run_trial(replace(first, points=(own, sharing))))
+        assert len(judged) == 1
+        alone = rows_of(run_trial(replace(first, points=(own,))))
+        alone += rows_of(run_trial(replace(first, views=(elsewhere,), points=(other,))))
+        assert joint == sorted(alone)
+        assert len(alone) > (4 if threshold else 1)
+
+
+def rows_of(record: TrialRecord) -> list[str]:
+    """The rows of a record as sorted texts, without their times."""
+    rows = []
+    for table, own_rows in record.to_data().items():
+        for row in own_rows:
+            kept = {name: value for name, value in row.items() if "seconds" not in name}
+            rows.append(f"{table} {sorted(kept.items())}")
+    return sorted(rows)
+
+
 def test_a_study_records_signals_findings_and_counts_over_grids(damaged: Board) -> None:
     record = run_trial(trial_before(damaged, number=4))
     (run,) = record.runs
