@@ -27,7 +27,8 @@ from harness.runs.calibration import QuietRun, threshold_of
 from harness.runs.journal import PICTURES, Journal
 from harness.runs.options import EngineOptions
 from harness.runs.pictures import examples_as_text, examples_of_text
-from harness.runs.plan import plan_of
+from harness.runs.plan import parts_of, plan_of
+from harness.runs.shards import WHOLE
 from harness.runs.study_record import (
     RECORDED_PROVENANCE,
     failures_by_point,
@@ -35,6 +36,7 @@ from harness.runs.study_record import (
     without_limit,
 )
 from harness.runs.tables import tables_of
+from harness.trials.references import ReferenceBoards
 from harness.trials.trial import Trial, run_trial
 from harness.vocabulary.declaration.yaml_source import DeclarationError
 from harness.vocabulary.errors import UserError
@@ -127,10 +129,54 @@ def test_groups_that_differ_in_damage_share_their_trials_before_thresholds(tmp_p
         ]
     for group in (first, second):
         tasks = [task for batch in group.then for _, task in group.trials(batch, AT_5)]
-        assert len(tasks) == 7
-        assert {point.digest for task in tasks for point in task.points} == {
-            point.digest for point in group.points
-        }
+        damaged = [task for task in tasks if task.role == "damaged"]
+        assert len(damaged) == 4
+        for task in damaged:
+            assert [point.digest for point in task.points] == [p.digest for p in group.points]
+            assert all(not point.left_out for point in task.points)
+
+
+def test_groups_that_differ_in_damage_share_their_hole_free_boards(tmp_path):
+    """Each point with the board from which its own damage is left out."""
+    by_damage = f"sweep={{source.target.damage: {json.dumps(KINDS)}, capture.frames: [1, 2]}}"
+    plan = plan_of(load_experiment(written(tmp_path), [by_damage]), tmp_path)
+    first, second = plan.groups
+    assert [len(parts) for parts in parts_of(plan, WHOLE)[1]] == [4 + 3, 4]
+    for batch, own in zip(first.hole_free, second.hole_free, strict=True):
+        assert own.paths == batch.paths
+        assert not list(second.trials(own, AT_5))
+        ((_, task),) = first.trials(batch, AT_5)
+        assert [point.digest for point in task.points] == [
+            point.digest for point in (*first.points, *second.points)
+        ]
+        assert task.views == batch.views
+        left_out = [point.left_out for point in task.points]
+        assert left_out == [(), (), own.views, own.views]
+        assert {len(view.target.damages) for view in (*batch.views, *own.views)} == {3, 5}
+        # a point without a threshold is not judged
+        thresholds = {point.digest: 5.0 for point in first.points}
+        ((_, task),) = first.trials(batch, thresholds)
+        assert len(task.points) == 2
+
+
+def test_groups_of_several_views_or_other_references_share_no_hole_free_boards(tmp_path):
+    by_damage = f"sweep={{source.target.damage: {json.dumps(KINDS)}}}"
+    first, second = plan_of(load_experiment(written(tmp_path), [by_damage]), tmp_path).groups
+    assert second.shows_the_same_hole_free(first)
+    assert not replace(second, poses="several").shows_the_same_hole_free(first)
+    (batch, *others) = second.hole_free
+    other_unit = batch.views[0].camera.model_copy(update={"unit_seed": 2})
+    for changed in (
+        replace(batch, units=(other_unit,)),
+        replace(batch, views=(replace(batch.views[0], camera=other_unit),)),
+        replace(batch, references=ReferenceBoards(earlier=batch.views)),
+        replace(batch, renders=others[0].renders),
+    ):
+        changed_group = replace(second, then=(changed, *others))
+        assert not changed_group.shows_the_same_hole_free(first)
+
+
+def test_groups_of_other_cameras_or_distances_share_no_trials(tmp_path):
     for separation in ("source.camera.unit_seed: [1, 2]", "source.target.distance_m: [0.6, 0.7]"):
         groups = plan_of(
             load_experiment(written(tmp_path), [f"sweep={{{separation}}}"]), tmp_path

@@ -209,10 +209,12 @@ def test_points_that_leave_out_other_damage_share_frames_and_findings(
         return judge(labelled, criteria)
 
     monkeypatch.setattr(trials, "judge", counting)
-    first = trial_before(hole_free, point_of("first", digest="1"), number=2)
+    first = trial_before(hole_free, point_of("first", threshold=3.0), number=2)
     (view,) = first.views
     data = view.target.to_data()
-    wide_hole = {**data["holes"][0], "diameter_mm": 40.0, "centre_mm": [30.0, -20.0]}
+    finding = run_trial(first).findings[0]
+    place_mm = [finding.x_mm, finding.y_mm]
+    wide_hole = {**data["holes"][0], "diameter_mm": 40.0, "centre_mm": place_mm}
     elsewhere = replace(view, target=type(view.target).from_data({**data, "holes": [wide_hole]}))
     for threshold in (3.0, None):
         own = point_of("first", digest="1", threshold=threshold)
