@@ -238,16 +238,16 @@ class Group:
             is_judged = thresholds is None or batch in self.first or threshold is not None
             if is_judged and point.digest not in without:
                 learned = self.learned.get(point.digest)
-                judging = trial_point(point, threshold, learned)
-                points.append((self.repeats(batch, point), judging, shown))
+                count = self.repeats(batch, point)
+                points.append((count, trial_point(point, threshold, learned), shown))
         if repeats is None:
             repeats = range(max((count for count, _, _ in points), default=0))
         for repeat in repeats:
             judging = []
-            for count, point, shown in points:
+            for count, of_trial, shown in points:
                 if repeat < count:
                     left_out = () if shown is batch else shown.before(repeat)
-                    judging.append(replace(point, left_out=left_out))
+                    judging.append(replace(of_trial, left_out=left_out))
             if not judging:
                 continue
             trial = Trial(
