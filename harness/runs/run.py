@@ -19,7 +19,7 @@ from harness.runs.job_batches import (
 from harness.runs.jobs import Ended, Job, JobEngine, Outcome
 from harness.runs.journal import Journal, record_text
 from harness.runs.pictures import pictures_of
-from harness.runs.plan import PlanPart, RenderJob, SweepPlan, parts_of
+from harness.runs.plan import Group, PlanPart, RenderJob, SweepPlan, parts_of
 from harness.runs.shards import WHOLE, Shard
 from harness.trials.learning import learn, learned_file
 from harness.trials.trial import Trial, run_trial
@@ -304,11 +304,23 @@ class _Run:
         self.outcome.trials.total += len(trials) - len(part.repeats)
         if part.sets_threshold:
             return self._shard.rotated(trials)
-        for thresholds in self._others_thresholds[part.group]:
+        for thresholds in self._others_thresholds_of(group):
             others_tasks = group.trials(part.batch, thresholds, part.repeats)
             for trial, (others_key, others_task) in zip(trials, others_tasks, strict=True):
                 self._refile(trial, others_key, others_task)
         return trials
+
+    def _others_thresholds_of(self, group: Group) -> list[dict[str, float]]:
+        """Return other shards' thresholds of a group, each set with one of each group that shares
+        its hole-free boards. A trial that a shard has judged at other pairs is judged again."""
+        by_group = []
+        for number, other in enumerate(self._groups):
+            if other is group or (other.is_shared and other.leader is group):
+                by_group.append(self._others_thresholds[number])
+        joined = []
+        for of_shard in zip(*by_group, strict=False):
+            joined.append({digest: k for own in of_shard for digest, k in own.items()})
+        return joined
 
     def _refile(self, trial: _Trial, others_key: str, others_task: Trial) -> None:
         """File what another shard has judged under this run's key, unless it is there."""
