@@ -141,9 +141,7 @@ def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
         )
         assert outcome.renders.done == len(plan.renders)
         pictures = [
-            f"pictures of set-up {n}"
-            for n, group in enumerate(plan.groups)
-            if is_shown(group)
+            f"pictures of set-up {n}" for n, group in enumerate(plan.groups) if is_shown(group)
         ]
         assert examples_of(plan, outcome, Pretended(seed)) == pictures
         result = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
