@@ -45,7 +45,7 @@ COLOURS = {"found": "blue", "missed": "red", "undecided": "grey"}
 
 @dataclass(frozen=True)
 class _LogScale:
-    """Where the values of a logarithmic axis stand in a panel."""
+    """The places of a logarithmic axis' values in a panel."""
 
     ends: tuple[float, float]
     """The values at its ends; others are drawn there."""

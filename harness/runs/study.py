@@ -18,12 +18,13 @@ from harness.experiment.schema import Experiment
 from harness.records.examples import ExampleCloud, MappedExample, StudyExample
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
+from harness.report.blocks import BILL
 from harness.report.claims import claim_set_of
 from harness.report.page import write_report
 from harness.report.sections import final_tables
 from harness.report.study_page import study_html, study_parts
 from harness.report.summaries import as_files, summaries
-from harness.runs.bill import BILL, Bill, Metered
+from harness.runs.bill import Bill, Metered
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import pictures_from, render_missing, values_of
