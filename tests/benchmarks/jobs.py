@@ -5,7 +5,8 @@ that stores trials runs three times: from nothing; with its renders stored, but 
 everything stored. Each row is printed and stored in ``results/costs/jobs.csv`` as soon as it is
 known. A job that this code has already been measured on is left out (``--again``: measured again),
 so that the same command goes on after it was stopped. All takes some two hours on an idle machine
-with two cores.
+with two cores. What renders, trials and all else of each experiment cost from nothing is stored in
+``bills.csv`` beside it, from which ``--dry-run`` says what to expect.
 
 ``--quick`` runs the first look of each experiment instead, once, from nothing, for ``quick.csv``;
 all takes some fifteen minutes. ``--results results`` keeps what was made in that folder of
@@ -41,6 +42,9 @@ from typing import Any, TypeVar
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+from harness.experiment.load import load_experiment
+from harness.records.outputs import LATEST
+from harness.runs.expected import PastRun, kind_of, past_run
 from harness.vocabulary.code_digests import file_digests
 from harness.vocabulary.seeds import digest
 from tests.benchmarks.measuring import COSTS, cell_text, print_heads, print_row, write_rows
@@ -55,10 +59,14 @@ from tests.benchmarks.whole_jobs import (
 
 TABLE = "jobs.csv"
 QUICK_TABLE = "quick.csv"
-QUOTED = ROOT / "results" / "baselines" / "tables"
+BILLS = "bills.csv"
+BASELINES = ROOT / "results" / "baselines"
+QUOTED = BASELINES / "tables"
 """Folder of the tables that documents quote, without columns that they do not show."""
-TEXTS = ("job", "measured", "code", "before_measured")
+TEXTS = ("job", "measured", "code", "before_measured", "kind")
 """Columns that are no numbers."""
+COUNTS = ("renders", "trials")
+"""Columns of whole numbers."""
 CODE = ("detectors", "scenes", "harness")
 """Rooms whose code decides what jobs cost."""
 DIGITS = 8
@@ -111,7 +119,28 @@ class QuickRow:
     """Time by the wall clock."""
 
 
-AnyRow = TypeVar("AnyRow", Row, QuickRow)
+@dataclass(frozen=True)
+class BillRow:
+    """What the parts of an experiment cost from nothing, in processor seconds, as
+    `harness.runs.expected` reads it."""
+
+    job: str
+    """The experiment's name."""
+    kind: str
+    """Its kind: ``study``, ``maps`` or ``sweep``."""
+    renders: int
+    """Number of renders."""
+    trials: int
+    """Number of trials."""
+    renders_s: float
+    """Seconds of renders."""
+    trials_s: float
+    """Seconds of frames and detection."""
+    fixed_s: float
+    """Seconds of all else."""
+
+
+AnyRow = TypeVar("AnyRow", Row, QuickRow, BillRow)
 
 
 @dataclass(frozen=True)
@@ -134,6 +163,8 @@ class Runs:
     """With its renders stored."""
     all_stored: Spent | None = None
     """With everything stored."""
+    bill: PastRun | None = None
+    """What parts of the first cost, if it recorded that."""
 
 
 class Failed(Exception):
@@ -203,6 +234,8 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
         row = row_of(job.name, before, now, stored_row(path, job.name))
         store(path, row)
         print_values(row)
+        if now.bill is not None:
+            store_bill(out / BILLS, job, now.bill)
         if options.results is not None and folders["out"].exists():
             keep_results(folders["out"], options.results.absolute())
         shutil.rmtree(folders["out"], ignore_errors=True)
@@ -255,6 +288,8 @@ def runs_of(job: Job, checkout: Path, folders: Mapping[str, Path]) -> Runs:
     shutil.rmtree(work, ignore_errors=True)
     words = job.command(folders)
     from_nothing = run(checkout, words)
+    is_sweep = job.stored == job.name
+    bill = past_run(work / job.stored / LATEST) if is_sweep else None
     if job.makes and not any(work.glob(job.makes)):
         raise Failed(f"it made no {job.makes}")
     if not job.stored:
@@ -262,7 +297,7 @@ def runs_of(job: Job, checkout: Path, folders: Mapping[str, Path]) -> Runs:
     shutil.rmtree(work / job.stored)
     renders_stored = run(checkout, words)
     all_stored = run(checkout, words)
-    return Runs(from_nothing, renders_stored, all_stored)
+    return Runs(from_nothing, renders_stored, all_stored, bill)
 
 
 def run(checkout: Path, words: Sequence[str]) -> Spent:
@@ -377,7 +412,21 @@ def print_values(row: Row | QuickRow) -> None:
     print_row([cell_text(getattr(row, field.name)) for field in fields(row)])
 
 
-def store(path: Path, row: Row | QuickRow) -> None:
+def store_bill(path: Path, job: Job, bill: PastRun) -> None:
+    """Write what the parts of an experiment cost into the table of bills."""
+    row = BillRow(
+        job=job.name,
+        kind=kind_of(load_experiment(ROOT / job.experiment)),
+        renders=bill.renders,
+        trials=bill.trials,
+        renders_s=round(bill.renders_s, 1),
+        trials_s=round(bill.trials_s, 1),
+        fixed_s=round(bill.fixed_s, 1),
+    )
+    store(path, row)
+
+
+def store(path: Path, row: Row | QuickRow | BillRow) -> None:
     """Write a row into the table, in place of an earlier one of the same job."""
     rows = [stored for stored in stored_rows(path, type(row)) if stored.job != row.job]
     write_rows(path, type(row), sorted([*rows, row], key=attrgetter("job")))
@@ -392,12 +441,13 @@ def stored_row(path: Path, name: str) -> Row | None:
 
 
 def stored_rows(path: Path, row_type: type[AnyRow]) -> list[AnyRow]:
-    """Return the rows of a table; if it does not exist yet, those that the documents quote."""
-    if not path.exists():
-        path = QUOTED / path.name
-    if not path.exists():
+    """Return the rows of a table; if it does not exist yet, those of the repository."""
+    existing = [
+        known for known in (path, QUOTED / path.name, BASELINES / path.name) if known.exists()
+    ]
+    if not existing:
         return []
-    with path.open(encoding="utf-8", newline="") as stream:
+    with existing[0].open(encoding="utf-8", newline="") as stream:
         return [row_of_texts(texts, row_type) for texts in csv.DictReader(stream)]
 
 
@@ -408,6 +458,8 @@ def row_of_texts(texts: Mapping[str, str], row_type: type[AnyRow]) -> AnyRow:
         text = texts.get(field.name, "")
         if field.name in TEXTS:
             values[field.name] = text
+        elif field.name in COUNTS:
+            values[field.name] = int(text)
         else:
             values[field.name] = float(text) if text else None
     return row_type(**values)
