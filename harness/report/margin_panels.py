@@ -88,7 +88,7 @@ def margin_panels(main: pd.DataFrame, rows_with_margins: pd.DataFrame) -> str:
     """Return the figure as SVG text. ``main``: rows of `SUMMARY` of the only set-up;
     ``rows_with_margins``: those of them that have a margin."""
     axes = _Axes.of(rows_with_margins)
-    panels = []
+    panels: list[dict[str, Any]] = []
     for size_mm, of_size in rows_with_margins.groupby("true_diameter_mm"):
         panel = _margin_panel(of_size.sort_values("frames"), axes)
         holes = ", ".join(of_size["hole"].unique()[:3])
@@ -123,13 +123,16 @@ def _margin_panel(of_size: pd.DataFrame, axes: _Axes) -> dict[str, Any]:
     the repeats, and a bar from the lowest to the highest."""
     marks = []
     points = []
-    for row in of_size.itertuples():
-        x_px = axes.frames.px(row.frames)
-        y_px = axes.margins.px(row.margin_mean)
-        bar_px = (axes.margins.px(row.margin_lowest), axes.margins.px(row.margin_highest))
-        colour = COLOURS[str(row.status)]
+    rows: list[dict[str, Any]] = of_size.to_dict("records")  # type: ignore[assignment]
+    for row in rows:
+        frames = float(row["frames"])
+        mean = float(row["margin_mean"])
+        x_px = axes.frames.px(frames)
+        y_px = axes.margins.px(mean)
+        bar_px = (axes.margins.px(row["margin_lowest"]), axes.margins.px(row["margin_highest"]))
+        colour = COLOURS[row["status"]]
         marks.append({"x": x_px, "y": y_px, "bar": bar_px, "colour": colour, "text": ""})
-        points.append((x_px, y_px, float(row.frames), float(row.margin_mean)))
+        points.append((x_px, y_px, frames, mean))
     lowest, highest = axes.margins.ends
     ticks = [tick for tick in LABELLED if lowest <= tick <= highest]
     return {

@@ -104,8 +104,8 @@ def _list(to_make: list[Planned], out: Path, processes: int) -> None:
             trials=total.trials + work.trials,
         )
         print(f"{_named(planned.names)}: {_in_words(work)}", flush=True)
-    work = expected.RunWork(total.renders, total.trials)
-    cost = expected.expected(out, EXPERIMENT, "study", work, processes)
+    all_work = expected.RunWork(total.renders, total.trials)
+    cost = expected.expected(out, EXPERIMENT, "study", all_work, processes)
     print(f"in all: {_in_words(total)}; {cost}")
 
 
