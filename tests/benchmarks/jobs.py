@@ -247,7 +247,10 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
 
 def prepare(checkout: Path) -> None:
     """Compile the inner loops of a checkout, which no job's time is to include."""
-    command = [sys.executable, "-m", "harness", "prepare"]
+    words = ["harness", "prepare"]
+    if (checkout / "harness" / "prepare.py").exists():  # in November 2026 it was a program apart
+        words = ["harness.prepare"]
+    command = [sys.executable, "-m", *words]
     subprocess.run(
         command, cwd=checkout, env=environment(checkout), stdout=subprocess.DEVNULL, check=False
     )
