@@ -186,20 +186,27 @@ def main() -> None:
     jobs = jobs_named(options.names)
     if options.quick:
         known = experiments()
-        quick_table([job for job in jobs if job in known], options)
+        all_well = quick_table([job for job in jobs if job in known], options)
     else:
-        full_table(jobs, options)
+        all_well = full_table(jobs, options)
+    raise SystemExit(int(not all_well))
 
 
-def quick_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
-    """Measure and store the first looks at experiments."""
+def quick_table(jobs: Sequence[Job], options: argparse.Namespace) -> bool:
+    """Measure and store the first looks at experiments. Return whether all ended well."""
     path = options.out.absolute() / QUICK_TABLE
     print_heads([field.name for field in fields(QuickRow)])
     prepare(ROOT)
     folders = folders_in(options.out.absolute())
+    all_well = True
     for job in left_to_measure(jobs, stored_rows(path, QuickRow), again=options.again):
         shutil.rmtree(folders["out"], ignore_errors=True)
-        spent = run(ROOT, [*job.command(folders), "--quick"])
+        try:
+            spent = run(ROOT, [*job.command(folders), "--quick"])
+        except Failed as failure:
+            print(f"{job.name}: {failure}", file=sys.stderr, flush=True)
+            all_well = False
+            continue
         row = QuickRow(
             job=job.name,
             measured=today(),
@@ -210,10 +217,11 @@ def quick_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
         shutil.rmtree(folders["out"])
         store(path, row)
         print_values(row)
+    return all_well
 
 
-def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
-    """Measure and store what jobs cost; ends with exit code 1 if one failed."""
+def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> bool:
+    """Measure and store what jobs cost. Return whether all ended well."""
     out = options.out.absolute()
     path = out / TABLE
     folders = folders_in(out)
@@ -221,7 +229,7 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
     before_at = None if options.before is None else options.before.absolute()
     for checkout in filter(None, (before_at, ROOT)):
         prepare(checkout)
-    has_failed = False
+    all_well = True
     make_inputs(folders)
     for job in left_to_measure(jobs, stored_rows(path, Row), again=options.again):
         try:
@@ -229,7 +237,7 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
             now = runs_of(job, ROOT, folders)
         except Failed as failure:
             print(f"{job.name}: {failure}", file=sys.stderr, flush=True)
-            has_failed = True
+            all_well = False
             continue
         row = row_of(job.name, before, now, stored_row(path, job.name))
         store(path, row)
@@ -239,7 +247,7 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> None:
         if options.results is not None and folders["out"].exists():
             keep_results(folders["out"], options.results.absolute())
         shutil.rmtree(folders["out"], ignore_errors=True)
-    raise SystemExit(int(has_failed))
+    return all_well
 
 
 # ---------------------------------------------------------------- runs
