@@ -50,6 +50,11 @@ def test_each_size_has_a_panel_and_one_counts_the_holes(summary: pd.DataFrame) -
     of_hole_1 = np.reshape(margins[0][1:], (-1, 4))
     assert of_hole_1[:, 2].tolist() == list(FRAMES)
     assert of_hole_1[:, 3] == pytest.approx(3 / 4)
+    # the panel, 82 high below its title, ends at a quarter beyond the lowest and highest margin
+    log_low = np.log(summary["margin_lowest"].min() / 1.25)
+    log_high = np.log(summary["margin_highest"].max() * 1.25)
+    share = (np.log(3 / 4) - log_low) / (log_high - log_low)
+    assert of_hole_1[0, 1] == pytest.approx(16 + 82 * (1 - share), abs=0.1)
     # an axis for all: the higher margin of hole 11 stands higher, by as much as the ticks say
     of_hole_11 = np.reshape(margins[-1][1:], (-1, 4))
     ticks = re.findall(r'<text x="-4" y="([\d.]+)" text-anchor="end">(\d+)<', drawing)
