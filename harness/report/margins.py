@@ -11,21 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.report import blocks
-from harness.vocabulary.text import many
+from harness.report.margin_panels import LABELLED, ROOM, margin_panels
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ACROSS = 4
-"""Panels side by side."""
 MOST_PANELS = 11
 """Most sizes with a panel each; one further panel counts the holes found."""
-LABELLED = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
-"""Values that may stand beside a logarithmic axis."""
-ROOM = 1.25
-"""Factor between the highest margin and the upper end of its axis."""
 LABEL_ROOM = 1.5
 """Factor below the lowest value for the name of its line."""
 STATUS_COLOURS = {"found": blocks.BLUE, "missed": blocks.RED, "undecided": blocks.GREY}
@@ -40,36 +34,8 @@ def margin_figure(main: pd.DataFrame) -> str | None:
         return None
     sizes_mm = rows_with_margins["true_diameter_mm"].unique()
     if rows_with_margins["frames"].nunique() > 1 and len(sizes_mm) <= MOST_PANELS:
-        return _by_frames(main, rows_with_margins)
+        return margin_panels(main, rows_with_margins)
     return _by_size(rows_with_margins)
-
-
-def _by_frames(main: pd.DataFrame, rows_with_margins: pd.DataFrame) -> str:
-    groups = list(rows_with_margins.groupby("true_diameter_mm"))
-    rows = -(-(len(groups) + 1) // ACROSS)
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(rows, ACROSS, sharex=True, squeeze=False).ravel()
-        for axes, (size_mm, group) in zip(panels, groups, strict=False):
-            holes = ", ".join(group["hole"].unique()[:3])
-            axes.set_title(f"no. {holes}: {size_mm:.1f} mm", fontsize=9)
-            _draw_margins(axes, group.sort_values("frames"), "frames")
-            _margin_axis(axes, rows_with_margins)
-            axes.tick_params(labelsize=8)
-        for axes in panels[: len(groups) : ACROSS]:
-            axes.set_ylabel("score / threshold", fontsize=9)
-        _draw_count(panels[len(groups)], main)
-        for axes in panels[len(groups) + 1 :]:
-            axes.set_visible(False)
-        panels[len(groups)].tick_params(labelsize=8)
-        _frames_axis(panels[0], rows_with_margins)
-        figure.supxlabel("frames averaged", fontsize=9)
-
-    alt = (
-        "Score over threshold of each hole against the number of averaged frames, and the number"
-        " of holes found."
-    )
-    return blocks.svg("margins", (6.8, 1.55 * rows + 0.3), alt, draw)
 
 
 def _by_size(rows_with_margins: pd.DataFrame) -> str:
@@ -115,26 +81,6 @@ def _frames_axis(axes: Axes, table: pd.DataFrame) -> None:
     axes.set_xscale("log")
     axes.set_xticks(frames, [f"{n:g}" for n in frames])
     axes.minorticks_off()
-
-
-def _draw_count(axes: Axes, main: pd.DataFrame) -> None:
-    """Draw the number of holes found against the number of frames."""
-    is_found = main["status"] == "found"
-    counts = is_found.groupby(main["frames"]).sum()
-    holes = main["hole"].nunique()
-    axes.set_title(f"found, of {many(holes, 'hole')}", fontsize=9)
-    axes.plot(counts.index, counts, color=blocks.INK, marker="o", ms=4, label="holes found")
-    axes.set_ylim(0, holes * 1.15)
-    for frames, count in counts.items():
-        axes.annotate(
-            str(count),
-            (float(str(frames)), count),
-            (0, -11),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
-    axes.set_yticks([0, holes], ["0", str(holes)])
 
 
 def threshold_figure(calls: pd.DataFrame, noise: pd.DataFrame) -> str | None:

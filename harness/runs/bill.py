@@ -5,24 +5,13 @@ process spends between jobs, some hundredths of a second at its start, is not co
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
 
-from harness.records.outputs import PROVENANCE
-from harness.report.blocks import BILL
 from harness.runs.jobs import Ended, Job, JobEngine, Stage
-from harness.vocabulary.files import RECORD_BYTES, bounded_bytes, strict_json
-from harness.vocabulary.text import many
 
 PHASES = ("imports", "plan", "renders", "frames", "detection", "statistics", "tables and page")
 FIXED = ("imports", "plan", "statistics", "tables and page")
 """Phases whose cost depends on neither renders nor trials."""
-SHOWN_IN_SECONDS = 90.0
-"""Longer times are shown in minutes."""
 
 
 class Bill:
@@ -99,105 +88,3 @@ class Metered:
         for job, ended in ended_jobs:
             self.bill.charge(job, ended)
         return ended_jobs
-
-
-def expected(out: Path, name: str, renders: int, trials: int, processes: int) -> str:
-    """Return what a run with this many renders and trials is expected to take, and from which
-    bills in ``out`` that follows: those of the same experiment as far as there are any, else of
-    others, else the `USUAL` costs."""
-    every = dict(_bills(out.glob(f"*/*/{PROVENANCE.name}")))
-    own = [bill for path, bill in every.items() if path.parent.parent.name == name]
-    basis = "by the bills of earlier runs of this experiment"
-    known = _unit_costs(own)
-    if None in known:
-        basis = "roughly, by the bills of other experiments"
-        known = known.or_else(_unit_costs([*every.values()]))
-    if None in known:
-        basis = f"very roughly: no such run has been billed in {out} yet"
-        known = known.or_else(USUAL)
-    fixed_s, render_s, trial_s = (seconds or 0.0 for seconds in known)
-    total_s = fixed_s + renders * render_s + trials * trial_s
-    cores = min(processes, os.cpu_count() or 1)
-    return (
-        f"expected from nothing: {_duration(total_s)} of processor time "
-        f"({_duration(renders * render_s)} for renders, {_duration(trials * trial_s)} for trials), "
-        f"or {_duration(total_s / cores)} on {many(cores, 'idle core')}; {basis}"
-    )
-
-
-def _duration(seconds: float) -> str:
-    """Return a time in words, in seconds or minutes."""
-    return f"{seconds:.0f} s" if seconds < SHOWN_IN_SECONDS else f"{seconds / 60:.1f} min"
-
-
-class _UnitCosts(NamedTuple):
-    """Processor seconds of parts of a run; None where no bill tells them."""
-
-    fixed_s: float | None
-    """The fixed part."""
-    render_s: float | None
-    """A render."""
-    trial_s: float | None
-    """A trial."""
-
-    def or_else(self, others: _UnitCosts) -> _UnitCosts:
-        """Return these costs, and ``others`` where they are not known."""
-        return _UnitCosts(
-            fixed_s=others.fixed_s if self.fixed_s is None else self.fixed_s,
-            render_s=others.render_s if self.render_s is None else self.render_s,
-            trial_s=others.trial_s if self.trial_s is None else self.trial_s,
-        )
-
-
-USUAL = _UnitCosts(fixed_s=12.0, render_s=0.25, trial_s=0.4)
-"""Costs of `detection_limit.yaml` (docs/performance.md)."""
-
-
-@dataclass(frozen=True)
-class _StoredBill:
-    """The bill of an earlier run."""
-
-    seconds: Mapping[str, float]
-    """Processor seconds by phase."""
-    renders: int
-    """Number of renders that it did."""
-    trials: int
-    """Number of trials that it did."""
-
-
-def _unit_costs(bills: Sequence[_StoredBill]) -> _UnitCosts:
-    """Return the costs by these bills. A run that found its renders or trials stored says nothing
-    of what they cost."""
-    fixed = [sum(bill.seconds[phase] for phase in FIXED) for bill in bills]
-    of_renders = [(bill.seconds["renders"], bill.renders) for bill in bills]
-    of_trials = [
-        (bill.seconds["frames"] + bill.seconds["detection"], bill.trials) for bill in bills
-    ]
-    return _UnitCosts(max(fixed, default=None), _mean_cost(of_renders), _mean_cost(of_trials))
-
-
-def _mean_cost(costs: Iterable[tuple[float, int]]) -> float | None:
-    """Return the seconds of one piece of work, from (seconds, pieces) of several runs; None if
-    none did any."""
-    seconds = 0.0
-    pieces = 0
-    for run_seconds, run_pieces in costs:
-        if run_pieces:
-            seconds += run_seconds
-            pieces += run_pieces
-    return seconds / pieces if pieces else None
-
-
-def _bills(paths: Iterable[Path]) -> Iterator[tuple[Path, _StoredBill]]:
-    """Yield the path and the bill of each run; the link to the latest is no further run."""
-    for path in paths:
-        if path.parent.is_symlink():
-            continue
-        try:
-            facts: Any = strict_json(bounded_bytes(path, RECORD_BYTES))
-            seconds = {phase: float(facts[BILL][phase]) for phase in PHASES}
-            renders = int(facts["renders"]["done"])
-            trials = int(facts["trials"]["done"])
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        yield path, _StoredBill(seconds, renders, trials)

@@ -12,11 +12,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from harness.experiment.schema import CaptureSource, Experiment
-from harness.runs.bill import expected
+from harness.runs.expected import RunWork, expected, kind_of
 from harness.runs.jobs import Outcome
 from harness.runs.journal import Journal
 from harness.runs.options import EngineOptions
-from harness.runs.plan import parts_of, plan_of
+from harness.runs.plan import SweepPlan, parts_of, plan_of
+from harness.runs.shards import Shard
 from harness.vocabulary.text import many
 
 PLAIN_EVERY_S = 10.0  # seconds between progress lines in a log, if there is no terminal
@@ -102,25 +103,48 @@ def dry_run(experiment: Experiment, out: Path, options: EngineOptions) -> int:
     if isinstance(experiment.config.source, CaptureSource):
         print(f"{name}: valid; {points} of a real capture; results: {folder}")
         return 0
-    plan = plan_of(experiment, Path(out) / ".cache" / "renders")
-    first, then = parts_of(plan, options.shard)
-    parts = [part for group in (*first, *then) for part in group]
-    renders = {path for part in parts for path in part.batch.paths}
-    trials = sum(len(part.repeats) for part in parts)
-    stored_records = len(Journal(folder / "journal"))
+    cache = Path(out) / ".cache" / "renders"
+    journal = Journal(folder / "journal")
+    plan = plan_of(experiment, cache)
+    views, work = _work_of(plan, options.shard)
+    of_first = first_work(experiment, journal, cache, options.shard)
     print(f"{name}: valid" + ("" if options.shard.is_whole else f"; shard {options.shard}"))
     print(f"  {points}, {many(len(plan.groups), 'set')} of frames")
-    study = experiment.config.study
-    most = " at most" if study is not None and study.precision is not None else ""
-    cached = sum(path.exists() for path in renders)
-    print(f"  renders: {len(renders)}{most}, {cached} of them cached")
-    print(f"  trials: {trials}{most}")
+    cached = sum(path.exists() for path in views)
+    most = "" if of_first is None else " at most"
+    print(f"  renders: {work.renders}{most}, {cached} of them cached")
+    print(f"  trials: {work.trials}{most}")
+    stored_records = len(journal)
     if stored_records:
         print(
             f"  the journal holds {many(stored_records, 'trial')}; those of the same code "
             "and settings are not run again"
         )
     processes = 1 if options.serial else options.jobs
-    print(f"  {expected(Path(out), name, len(renders), trials, processes)}")
+    kind = kind_of(experiment)
+    print(f"  {expected(Path(out), name, kind, work, processes, of_first)}")
     print(f"  results would go to {folder}")
     return 0
+
+
+def _work_of(plan: SweepPlan, shard: Shard) -> tuple[set[Path], RunWork]:
+    """Return the files of the views that a shard of a plan needs, and its amount of work."""
+    calibrating, judged = parts_of(plan, shard)
+    parts = [part for group in (*calibrating, *judged) for part in group]
+    views = {path for part in parts for path in part.batch.paths}
+    trials = sum(len(part.repeats) for part in parts)
+    return views, RunWork(len(views), trials)
+
+
+def first_work(
+    experiment: Experiment, journal: Journal, cache: Path, shard: Shard
+) -> RunWork | None:
+    """Return the work on the boards that a study with a precision needs in any case: the first,
+    and those that its journal has added. Return None for any other experiment."""
+    study = experiment.config.study
+    if study is None or study.precision is None:
+        return None
+    from harness.runs.precision import Batches  # loads the statistics of studies
+
+    first = Batches(experiment, journal, cache, experiment.folder(cache)).first()
+    return _work_of(first, shard)[1]

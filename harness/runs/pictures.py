@@ -11,7 +11,7 @@ import numpy as np
 from detectors.interface import Detection, Evidence
 from detectors.views.mapping.merge import SEVERAL, Mapped
 from harness.evaluation.study.limit import SetUpLimit
-from harness.experiment.schema import Point
+from harness.experiment.schema import MAIN, Point
 from harness.records.examples import (
     Circle3d,
     CircleKind,
@@ -24,7 +24,7 @@ from harness.records.examples import (
 )
 from harness.runs.journal import PICTURES
 from harness.runs.plan import Batch, Group, SweepPlan
-from harness.trials.averages import Averaging, averages_of
+from harness.trials.averages import averages_of
 from harness.trials.board import Board, LabelledCloud, load_board
 from harness.trials.clouds import MapClouds, TrialPoint, mapping_of
 from harness.trials.judge import Criteria, Judgement, detector_for, judge
@@ -42,6 +42,14 @@ ROOM_MM = 12.0  # margin around the largest damage of a set-up, whose pictures a
 GREY = 160
 ARRAYS = ("residual_mm", "detected", "outline_px")
 """Fields of a study's example that are arrays."""
+
+
+def is_shown(group: Group) -> bool:
+    """Return whether a page shows pictures of a group that is no study's: it does of maps, and of
+    the only set-up of an experiment, but not of several set-ups or of variations."""
+    if group.damaged.board is not None:
+        return False
+    return group.poses is not None or any(point.variant == MAIN for point in group.points)
 
 
 def pictures_of(
@@ -81,20 +89,17 @@ def _pixels_of(detections: Iterable[Detection], evidence: Evidence) -> np.ndarra
 
 
 def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[ExampleCloud]:
-    """Return the clouds of repeat 0 of each variant of a group, at its smallest and largest number
-    of frames."""
+    """Return the clouds of repeat 0 of an experiment's only set-up, at its smallest and largest
+    number of frames."""
     batch = group.damaged
     _, trial = next(group.trials(batch, thresholds))
     most = max(point.frames for point in trial.points)
+    shown = [point for point in trial.points if point.variant == MAIN]
     board = load_board(batch.views[0])
     holes = tuple(_hole_in_view(board, damage) for damage in board.truth)
     examples = []
-    seen: dict[tuple[Averaging, int], LabelledCloud] = {}
-    for point in _fewest_and_most_frames(trial.points):
-        seen_as = (point.averaging, point.frames)
-        if seen_as not in seen:
-            seen[seen_as] = _seen_again(trial, point, most)
-        evidence, detected = _found(seen[seen_as], point.criteria)
+    for point in _fewest_and_most_frames(shown):
+        evidence, detected = _found(_seen_again(trial, point, most), point.criteria)
         example = ExampleCloud(
             frames=point.frames,
             variant=point.variant,
@@ -109,17 +114,9 @@ def _cloud_examples(group: Group, thresholds: Mapping[str, float]) -> list[Examp
 
 
 def _fewest_and_most_frames(points: Sequence[TrialPoint]) -> list[TrialPoint]:
-    """Return the points of each variant with the fewest and, if there are several, with the most
-    frames."""
-    by_variant: dict[str, list[TrialPoint]] = {}
-    for point in sorted(points, key=lambda point: point.frames):
-        by_variant.setdefault(point.variant, []).append(point)
-    ends = []
-    for ascending in by_variant.values():
-        ends.append(ascending[0])
-        if len(ascending) > 1:
-            ends.append(ascending[-1])
-    return ends
+    """Return the points with the fewest and, if there are several, with the most frames."""
+    ascending = sorted(points, key=lambda point: point.frames)
+    return [*ascending[:1], *ascending[1:][-1:]]
 
 
 def _hole_in_view(board: Board, damage: Damage) -> HoleInView:

@@ -18,7 +18,7 @@ from harness.runs.job_batches import (
 )
 from harness.runs.jobs import Ended, Job, JobEngine, Outcome
 from harness.runs.journal import Journal, record_text
-from harness.runs.pictures import pictures_of
+from harness.runs.pictures import is_shown, pictures_of
 from harness.runs.plan import Group, PlanPart, RenderJob, SweepPlan, parts_of
 from harness.runs.shards import WHOLE, Shard
 from harness.trials.learning import learn, learned_file
@@ -83,12 +83,12 @@ def run_plan(
 def examples_of(
     plan: SweepPlan, outcome: Outcome, engine: JobEngine
 ) -> list[ExampleCloud | MappedExample]:
-    """Draw the pictures of all judged groups, except in studies, whose limits determine which
-    boards are shown. What fails is added to the outcome."""
+    """Draw the pictures that the page shows of judged groups, except in studies, whose limits
+    determine which boards are shown. What fails is added to the outcome."""
     groups = []
     for group in plan.groups:
         is_judged = any(point.digest in outcome.thresholds for point in group.points)
-        if group.damaged.board is None and is_judged:
+        if is_judged and is_shown(group):
             groups.append(group)
     renders = [render for group in groups for render in group.damaged.renders]
     failures = render_missing(renders, engine)

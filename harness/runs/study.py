@@ -18,12 +18,13 @@ from harness.experiment.schema import Experiment
 from harness.records.examples import ExampleCloud, MappedExample, StudyExample
 from harness.records.outputs import EXPERIMENT, PROVENANCE, REPORT, STUDY
 from harness.records.trials import ResultTables
+from harness.report.blocks import BILL
 from harness.report.claims import claim_set_of
 from harness.report.page import write_report
 from harness.report.sections import final_tables
 from harness.report.study_page import study_html, study_parts
 from harness.report.summaries import as_files, summaries
-from harness.runs.bill import BILL, Bill, Metered
+from harness.runs.bill import Bill, Metered
 from harness.runs.engines import engine_of
 from harness.runs.estimate import progress_display
 from harness.runs.job_batches import pictures_from, render_missing, values_of
@@ -100,41 +101,22 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
             Metered(plain_engine, bill) as engine,
         ):
             bill.begin("detection")
-            with progress_display() as report:
-                run = partial(
-                    run_plan,
-                    journal=journal,
-                    engine=engine,
-                    report=report,
-                    shard=options.shard,
-                    retry_failed=options.retry_failed,
-                )
-                outcome = run(plan)
-                while following := batches.after(plan, outcome, engine):
-                    plan = following
-                    outcome = run(plan).counted_after(outcome)
+            plan, outcome = _carried_out(plan, batches, engine, options)
             if not options.shard.is_whole:
                 return _shard_over(options.shard, outcome, folder)
             if not outcome.finished or not outcome.thresholds:
                 return _nothing_to_report(experiment, outcome)
             bill.begin("tables and page")
-            results = origin_of(outcome, resolved_yaml(experiment), origin["digests"])
-            written = Written(folder, results)
-            shown = written.shown_again(outcome)
-            if shown is None:
-                print("writing tables and report", file=sys.stderr)
-                shown = _write_results(
-                    folder,
-                    experiment=experiment,
-                    plan=plan,
-                    outcome=outcome,
-                    journal=journal,
-                    engine=engine,
-                    origin=origin,
-                    began=began,
-                )
-                if not outcome.failures:  # what failed may succeed the next time
-                    written.store(shown)
+            shown = _results(
+                folder,
+                experiment=experiment,
+                plan=plan,
+                outcome=outcome,
+                journal=journal,
+                engine=engine,
+                origin=origin,
+                began=began,
+            )
         if options.cache_limit_gb is not None:
             limit_bytes = round(options.cache_limit_gb * 1e9)
             trim_cache(cache, limit_bytes, keep=[render.path for render in plan.renders])
@@ -148,6 +130,27 @@ def run_study(experiment: Experiment, out: Path, options: EngineOptions, command
     print(bill.in_words(), file=sys.stderr)
     print(f"report: {folder / REPORT.name}")
     return 1 if outcome.failures else 0
+
+
+def _carried_out(
+    plan: SweepPlan, batches: Batches, engine: Metered, options: EngineOptions
+) -> tuple[SweepPlan, Outcome]:
+    """Run the first plan of an experiment, and those that follow from it. Return the last, which
+    holds the trials of all, and its outcome."""
+    with progress_display() as report:
+        run = partial(
+            run_plan,
+            journal=batches.journal,
+            engine=engine,
+            report=report,
+            shard=options.shard,
+            retry_failed=options.retry_failed,
+        )
+        outcome = run(plan)
+        while following := batches.after(plan, outcome, engine):
+            plan = following
+            outcome = run(plan).counted_after(outcome)
+    return plan, outcome
 
 
 def _shard_over(shard: Shard, outcome: Outcome, folder: Path) -> int:
@@ -171,6 +174,40 @@ def _refuse_newer(folder: Path) -> None:
         return
     if type(version) is int and version > RESULTS_VERSION:
         check_version(version, RESULTS_VERSION, folder / PROVENANCE.name, "a result folder")
+
+
+def _results(
+    folder: Path,
+    *,
+    experiment: Experiment,
+    plan: SweepPlan,
+    outcome: Outcome,
+    journal: Journal,
+    engine: Metered,
+    origin: dict[str, Any],
+    began: float,
+) -> list[str | Grid]:
+    """Return what the terminal shows of the results. They are written unless the folder has them
+    as they would be written."""
+    results = origin_of(outcome, resolved_yaml(experiment), origin["digests"])
+    written = Written(folder, results)
+    shown = written.shown_again(outcome)
+    if shown is not None:
+        return shown
+    print("writing tables and report", file=sys.stderr)
+    shown = _write_results(
+        folder,
+        experiment=experiment,
+        plan=plan,
+        outcome=outcome,
+        journal=journal,
+        engine=engine,
+        origin=origin,
+        began=began,
+    )
+    if not outcome.failures:  # what failed may succeed the next time
+        written.store(shown)
+    return shown
 
 
 def _write_results(

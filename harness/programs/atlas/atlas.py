@@ -93,7 +93,7 @@ def main(options: argparse.Namespace, command: str) -> int:
 def _list(to_make: list[Planned], out: Path, processes: int) -> None:
     """Print the work on each camera, and what all is expected to cost."""
     from harness.programs.atlas.making import EXPERIMENT, Work
-    from harness.runs.bill import expected
+    from harness.runs import expected
 
     total = Work(parts=0, renders=0, trials=0)
     for planned in to_make:
@@ -104,7 +104,8 @@ def _list(to_make: list[Planned], out: Path, processes: int) -> None:
             trials=total.trials + work.trials,
         )
         print(f"{_named(planned.names)}: {_in_words(work)}", flush=True)
-    cost = expected(out, EXPERIMENT, total.renders, total.trials, processes)
+    all_work = expected.RunWork(total.renders, total.trials)
+    cost = expected.expected(out, EXPERIMENT, "study", all_work, processes)
     print(f"in all: {_in_words(total)}; {cost}")
 
 

@@ -21,7 +21,8 @@ from harness.programs.atlas.shards import measured_noise, parts_of, sites_of
 from harness.programs.atlas.stored import CameraLimits, KindLimits, SetUp
 from harness.records.outputs import EXPERIMENT as EXPERIMENT_FILE
 from harness.records.outputs import PROVENANCE
-from harness.runs.bill import BILL, Bill, Metered
+from harness.report.blocks import BILL
+from harness.runs.bill import Bill, Metered
 from harness.runs.estimate import progress_display
 from harness.runs.jobs import JobEngine, Outcome
 from harness.runs.journal import Journal

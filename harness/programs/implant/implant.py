@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,21 @@ def _options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE.yaml",
         help="the captures' camera, or the most similar one",
     )
+    _add_damage(add)
+    _add_study(add)
+    _add_judging(add)
+    cli.add_reading(add)
+    add(
+        "--out",
+        type=Path,
+        default=Path("results/implant"),
+        metavar="DIR",
+        help="default: results/implant",
+    )
+
+
+def _add_damage(add: Callable[..., Any]) -> None:
+    """Add the options of the damage, and of the part that it is in."""
     add(
         "--damage",
         required=True,
@@ -92,6 +108,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         default=0.6,
         help="albedo of part and backing at this wavelength (default: 0.6)",
     )
+
+
+def _add_study(add: Callable[..., Any]) -> None:
+    """Add the options of what is planned: frames, places and sizes."""
     add(
         "--frames",
         type=int,
@@ -121,6 +141,10 @@ def _options(parser: argparse.ArgumentParser) -> None:
         "largest damage)",
     )
     add("--seed", type=int, default=1, help="seed of places, sizes and noise (default: 1)")
+
+
+def _add_judging(add: Callable[..., Any]) -> None:
+    """Add the options of the detector and its threshold."""
     calls = (
         "expected number, which sets the threshold as in tofpod detect (default: "
         f"{cli.DEFAULT_FALSE_CALLS:g})"
@@ -146,14 +170,6 @@ def _options(parser: argparse.ArgumentParser) -> None:
         help="a setting of the detector: surface.degree=5",
     )
     add("--crop", default="auto", metavar="KIND", help=f"the target: {cli.LEGAL_CROP}")
-    cli.add_reading(add)
-    add(
-        "--out",
-        type=Path,
-        default=Path("results/implant"),
-        metavar="DIR",
-        help="default: results/implant",
-    )
 
 
 @program(

@@ -43,12 +43,28 @@ def test_a_margin_is_the_highest_score_over_the_threshold(summary: pd.DataFrame)
 
 
 def test_each_size_has_a_panel_and_one_counts_the_holes(summary: pd.DataFrame) -> None:
-    lines = lines_of(str(margin_figure(summary)))
+    drawing = str(margin_figure(summary))
+    lines = lines_of(drawing)
     margins = [line for line in lines if line[0] == "score / threshold"]
     assert len(margins) == 11
     of_hole_1 = np.reshape(margins[0][1:], (-1, 4))
     assert of_hole_1[:, 2].tolist() == list(FRAMES)
     assert of_hole_1[:, 3] == pytest.approx(3 / 4)
+    # the panel, 82 high below its title, ends at a quarter beyond the lowest and highest margin
+    log_low = np.log(summary["margin_lowest"].min() / 1.25)
+    log_high = np.log(summary["margin_highest"].max() * 1.25)
+    share = (np.log(3 / 4) - log_low) / (log_high - log_low)
+    assert of_hole_1[0, 1] == pytest.approx(16 + 82 * (1 - share), abs=0.1)
+    # an axis for all: the higher margin of hole 11 stands higher, by as much as the ticks say
+    of_hole_11 = np.reshape(margins[-1][1:], (-1, 4))
+    ticks = re.findall(r'<text x="-4" y="([\d.]+)" text-anchor="end">(\d+)<', drawing)
+    y_px = {text: float(y) for y, text in ticks[:3]}
+    px_per_log = (y_px["2"] - y_px["1"]) / np.log(2)
+    panels_px = 2 * 106  # two rows of panels lie between
+    risen_px = of_hole_11[0, 1] - panels_px - of_hole_1[0, 1]
+    assert risen_px == pytest.approx(
+        px_per_log * np.log(of_hole_11[0, 3] / of_hole_1[0, 3]), abs=0.3
+    )
     (counts,) = [line for line in lines if line[0] == "holes found"]
     counts_found = [(summary["status"] == "found")[summary["frames"] == n].sum() for n in FRAMES]
     assert np.reshape(counts[1:], (-1, 4))[:, 3].tolist() == counts_found

@@ -149,6 +149,32 @@ def test_a_finished_sweep_draws_no_pictures(finished, monkeypatch, tmp_path):
     assert page.read_text() == again
 
 
+def test_a_page_without_a_picture_that_failed_is_written_again(finished, monkeypatch, tmp_path):
+    """A run with failures keeps no record that all is written: what failed may succeed later."""
+
+    def faulty(*arguments: Any) -> Any:
+        raise OSError("no memory for a picture")
+
+    out = tmp_path / "out"
+    shutil.copytree(finished, out, symlinks=True)
+    page = results(out) / "report.html"
+    record = results(out) / "written.json"
+    whole = page.read_text()
+    page.unlink()
+    experiment = load_experiment(finished.parent / "tiny.yaml")
+    serial = EngineOptions(serial=True)
+    record.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "pictures_of", faulty)
+        assert study.run_study(experiment, out, serial, "again") == 1
+    assert 'id="residual"' in whole
+    assert 'id="residual"' not in page.read_text()
+    assert not record.exists()
+    assert study.run_study(experiment, out, serial, "again") == 0
+    assert 'id="residual"' in page.read_text()
+    assert record.exists()
+
+
 def test_a_half_finished_sweep_resumes_to_the_same_numbers(finished, tmp_path):
     half = tmp_path / "half"
     shutil.copytree(finished, half)

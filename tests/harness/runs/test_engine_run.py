@@ -17,6 +17,7 @@ from harness.programs.cluster.merge import merge_into
 from harness.runs import run as engine_run
 from harness.runs.jobs import Ended, Job, Outcome, Stage, State
 from harness.runs.journal import Journal, record_text
+from harness.runs.pictures import is_shown
 from harness.runs.plan import Group, SweepPlan, parts_of, plan_of
 from harness.runs.run import examples_of, run_plan
 from harness.runs.shards import Shard
@@ -140,14 +141,38 @@ def test_every_trial_and_picture_is_begun_once_in_any_order(plan, tmp_path):
         )
         assert outcome.renders.done == len(plan.renders)
         pictures = [
-            f"pictures of set-up {n}"
-            for n, group in enumerate(plan.groups)
-            if group.damaged.board is None
+            f"pictures of set-up {n}" for n, group in enumerate(plan.groups) if is_shown(group)
         ]
         assert examples_of(plan, outcome, Pretended(seed)) == pictures
         result = (records(tmp_path / str(seed)), outcome.thresholds, outcome.finished)
         assert expected is None or result == expected
         expected = result
+
+
+VARIED = """\
+sensitivity:
+  repeats: 1
+  calibration_repeats: 1
+  frames: [3]
+  vary:
+    - {path: source.camera.unit_seed, values: [2, 3], reason: another unit}
+"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "drawn"),
+    [
+        ([], ["pictures of set-up 0"]),
+        (["sweep={source.camera.unit_seed: [1, 2]}", "sensitivity=null"], []),
+    ],
+)
+def test_pictures_are_drawn_only_of_what_a_page_shows(changes, drawn, tmp_path):
+    """A page shows the clouds of the only set-up, but neither of several nor of variations."""
+    (tmp_path / "tiny.yaml").write_text(TINY + VARIED)
+    plan = plan_of(load_experiment(tmp_path / "tiny.yaml", changes), tmp_path / "renders")
+    outcome = go(plan, tmp_path / "journal", Pretended())
+    assert len(plan.groups) > 1
+    assert examples_of(plan, outcome, Pretended()) == drawn
 
 
 def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
@@ -176,8 +201,8 @@ def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
         if number == 0:
             assert not engine.begun, "nothing is rendered or run again"
             assert examples_of(plan, outcome, engine) == examples_of(plan, complete, Pretended())
-            simple = [group for group in plan.groups if group.damaged.board is None]
-            shown = {job.path.name for group in simple for job in group.damaged.renders}
+            groups = [group for group in plan.groups if is_shown(group)]
+            shown = {job.path.name for group in groups for job in group.damaged.renders}
             assert {name for name in engine.begun if name.endswith(".npz")} == shown
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from harness.evaluation.study.record import read_record
 from harness.evaluation.study.sequential import FIRST_BOARDS
 from harness.experiment.load import load_experiment
 from harness.programs.gate import check
+from harness.runs.estimate import first_work
 from harness.runs.journal import DESIGNS, Journal
 from harness.runs.plan import plan_of
 from harness.runs.precision import recorded_designs
+from harness.runs.shards import Shard
 from harness.vocabulary.declaration.yaml_source import DeclarationError
 from tests.support.tiny_sweep import STUDY, content, results, sweep
 
@@ -126,9 +129,15 @@ def test_a_check_is_refused(whole, tmp_path, capsys):
     assert "study.precision=null" in capsys.readouterr().err
 
 
-def test_a_dry_run_says_at_most(whole, tmp_path):
+def test_a_dry_run_says_what_is_expected_and_at_most(whole, tmp_path):
     shown = sweep(whole / "tiny.yaml", tmp_path, "--dry-run").stdout
-    assert " at most" in shown
+    counted = re.search(r"renders: (\d+) at most, 0 of them cached\n  trials: (\d+) at most", shown)
+    assert counted is not None
+    assert re.search(r"expected from nothing: .* idle cores, at most \d", shown)
+    # the first boards, and with them the expectation, are fewer than those at most
+    experiment = load_experiment(whole / "tiny.yaml")
+    first = first_work(experiment, Journal(tmp_path / "none"), tmp_path, Shard())
+    assert first is not None and 0 < first.trials < int(counted[2])
 
 
 @pytest.mark.parametrize(

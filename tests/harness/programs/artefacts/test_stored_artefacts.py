@@ -39,7 +39,13 @@ OF_FACTS = {
 """First lines of tables whose numbers no code of tofpod computes: of camera files, of sizes of
 files, and of packages in the index."""
 SHARE_OF_NUMBERS = 0.4
-MEASURED = {"jobs": jobs.Row, "steps": StepRow, "growth": GrowthRow, "peers": PeerRow}
+MEASURED = {
+    "jobs": jobs.Row,
+    "quick": jobs.QuickRow,
+    "steps": StepRow,
+    "growth": GrowthRow,
+    "peers": PeerRow,
+}
 """Rows of the tables that benchmarks write, by table."""
 AXES = ("source.", "compared_with")  # columns of axes are named as their keys
 REPAIR = "declare it in artefacts.yaml and put markers around or after it; see CONTRIBUTING.md"
