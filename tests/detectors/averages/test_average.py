@@ -343,11 +343,12 @@ def test_still_blocks_are_seen_without_their_medians() -> None:
     rng = np.random.default_rng(12)
     decisions = []
     for number in range(300):
-        share = rng.uniform(0.15, 0.35)
+        share = rng.uniform(0.15, 0.5)
         change_m = rng.choice([0.002, 0.004, 0.008])
         first = 0.7 + rng.normal(0, 0.001, (64, 9))
         second = first + rng.normal(0, 0.0005, (64, 9)) + (0.01 if number % 2 else 0.0)
-        second[: int(share * 64)] += rng.uniform(0.5, 1.5) * change_m
+        changed = second[: int(share * 64)]
+        changed += rng.uniform(0.5, 1.5) * change_m * (rng.random(changed.shape) < 0.7)
         second[rng.random(second.shape) < rng.choice([0.0, 0.4])] = np.nan
         differences = first - second
         counts = np.isfinite(differences).sum(axis=1)
