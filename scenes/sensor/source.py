@@ -22,10 +22,6 @@ from scenes.sensor.common.unit import DecodedFrame, frame_errors_m
 from scenes.sensor.empirical.imager import EmpiricalImager
 from scenes.sensor.lidar.scanner import LidarScanner
 
-WHOLE_FRAMES = 2
-"""First frames of a capture that go through the whole chain, although the first-order model holds:
-sorting a view's pixels costs as much as ten frames, and many captures have only one or two."""
-
 
 @dataclass(frozen=True)
 class SimulatedUnit:
@@ -159,7 +155,7 @@ class SimulatedCapture:
         rng = random_stream(self.seed, "frames", *self.labels)
         cut = self.unit.cut
         for number in range(self.n_frames):
-            decoded = self._drawn(number, rng)
+            decoded = self._drawn(float(self.errors_m[number]), rng)
             yield Frame(
                 f"frame {number}",
                 decoded.z_m[cut],
@@ -168,11 +164,11 @@ class SimulatedCapture:
                 amplitude=decoded.amplitude[cut],
             )
 
-    def _drawn(self, number: int, rng: np.random.Generator) -> DecodedFrame:
-        """Draw the frame of a number on the view's region, by the cheaper model that holds."""
+    def _drawn(self, error_m: float, rng: np.random.Generator) -> DecodedFrame:
+        """Draw a frame, displaced by ``error_m``, on the view's region, by the cheaper model that
+        holds."""
         unit = self.unit
-        error_m = float(self.errors_m[number])
-        model = unit.first_order if number >= WHOLE_FRAMES else None
+        model = unit.first_order
         if model is None or abs(error_m) > model.farthest_error_m:
             return unit.model.frame(unit.exposure, rng, error_m)
         return model.frame(rng, error_m)

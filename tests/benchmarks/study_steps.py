@@ -136,8 +136,7 @@ def run_all(trials: Sequence[Any]) -> None:
 
 
 def frames(runs: int) -> Iterator[StepRow]:
-    """Draw frames of a board with eight holes, 50 at a time, by camera. The first two of a capture
-    cost more."""
+    """Draw frames of a board with eight holes, 50 at a time, by camera."""
     from harness.trials.board import load_board
 
     with tempfile.TemporaryDirectory() as folder:

@@ -29,6 +29,7 @@ def draw_frames() -> None:
 
     from detectors.averages.average import AverageConfig, prefix_averages
     from harness.vocabulary.geometry import Region
+    from harness.vocabulary.seeds import random_stream
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import camera_names, load_camera
     from scenes.sensor.common.config import CameraConfig
@@ -42,8 +43,11 @@ def draw_frames() -> None:
         view = plane_view(
             camera, Region(row - 20, row + 20, column - 30, column + 30), 0.7, 0.6, 0.05, 0.02
         )
-        capture = SimulatedUnit(camera, CameraConfig(name=name), view).capture(6, 1)
+        unit = SimulatedUnit(camera, CameraConfig(name=name), view)
+        capture = unit.capture(6, 1)
         next(iter(capture.frames()))
+        # pixels that may saturate are drawn sample by sample, like all those of a whole frame
+        unit.model.frame(unit.exposure, random_stream(1))
     # no camera's file is empirical
     image = np.ones((2, 2), np.float32)
     number = np.float32(1)
@@ -62,18 +66,18 @@ def analyse() -> None:
     from scenes.closed_form import plane_view
     from scenes.sensor.camera import load_camera
     from scenes.sensor.common.config import CameraConfig
-    from scenes.sensor.source import WHOLE_FRAMES, SimulatedUnit
+    from scenes.sensor.source import SimulatedUnit
 
     camera = load_camera("azure_kinect_nfov")
     view = plane_view(camera, Region(300, 340, 300, 360), 0.7, 0.6, 0.05, 0.02)
     # so shallow that all of its pixels have a range, and the model of a hole is fitted
     view.phasor[:, 18:24, 28:34] *= np.exp(0.1j)
     unit = SimulatedUnit(camera, CameraConfig(edge_gate=False), view)
-    cloud = average(unit.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
+    cloud = average(unit.capture(3, 1), AverageConfig())
     # pixels at the rim of a deep hole are simulated one by one
     view.phasor[:, 18:24, 28:34] *= 1j
     deep = SimulatedUnit(camera, CameraConfig(), view)
-    average(deep.capture(WHOLE_FRAMES + 1, 1), AverageConfig())
+    average(deep.capture(3, 1), AverageConfig())
     surfaces = [{"method": method} for method in ("lar", "bisquare", "least_squares", "lts")]
     surfaces += [{"shape": shape} for shape in ("auto", "free_form")]
     wanted = [

@@ -24,6 +24,16 @@ class AmcwExposure(NamedTuple):
     shape: tuple[int, int]
     """(h, w) of the view."""
 
+    def part(self, pixels: np.ndarray) -> "AmcwExposure":
+        """Return the exposure of flat ``pixels`` (m,), as a view of 1 x m pixels."""
+        return AmcwExposure(
+            means=self.means.take(pixels, axis=-1),
+            sigma=self.sigma[pixels],
+            limit=self.limit[pixels],
+            time_share=self.time_share[pixels],
+            shape=(1, len(pixels)),
+        )
+
 
 def time_shares(facts: ExposuresFacts, fullness: np.ndarray) -> np.ndarray:
     """Return the exposure times (h, w) of a view's pixels over the longest.

@@ -3,12 +3,13 @@ by the whole chain.
 
 `first_order` sorts the pixels of a view once. Where all gates certainly pass a pixel and noise acts
 to first order, z and amplitude are moving sums of one normal each per pixel, and z is displaced and
-rounded (`linear_frames`). All other pixels, mostly at rims, go through the whole chain (`listed`),
-with noise that both kinds share. Differences to frames of the whole chain: the amplitude's noise is
-independent of that of z (in the whole chain their correlation is at most 0.1); at rims between
-surfaces of different brightness, amplitudes of neighbours correlate by up to 0.07 more; variance of
+rounded (`linear_frames`). All other pixels, mostly at rims, go through filter and engine
+(`listed`), with light that shares its noise with linear pixels (`halo`). Differences to frames of
+the whole chain: the amplitude's noise is independent of that of z (in the whole chain their
+correlation is at most 0.1); at rims between surfaces of different brightness, amplitudes of
+neighbours correlate by up to 0.07 more, on floors of small holes by up to 0.06 less; variance of
 second order (at most 2.5 %) is added to the centre's noise. The variance of z before the thesis'
-board agrees to 0.002 (even pixels), 0.010 (uneven) and 0.009 (listed; 400 frames of two cameras,
+board agrees to 0.002 (even pixels) and 0.010 (uneven and listed; 400 frames of two cameras,
 tests/validation/first_order.py)."""
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from harness.vocabulary.geometry import MM, Reason
 from scenes.sensor.amcw.certainty import Certainty, certainty
 from scenes.sensor.amcw.even import EvenMoves, even_pixels, fill_even
 from scenes.sensor.amcw.exposure import AmcwExposure
+from scenes.sensor.amcw.halo import Halo, drawn_light, halo_of
 from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.amcw.light import Light, light_of_samples
 from scenes.sensor.amcw.linear import DEVIATIONS, Moves, linearised, unknown_filtered
@@ -60,19 +62,6 @@ class _UnevenPixels(NamedTuple):
     """Changes by the noise of each pixel of their windows."""
 
 
-class HaloNoise(NamedTuple):
-    """Noise of the g pixels of the list's halo: it turns their readings into the normals that
-    linear pixels share."""
-
-    turn_back: np.ndarray
-    """(f, g) complex64: what turns a mean phasor to 1, over its deviation across, times the
-    frequency's share in the noise of z."""
-    mean_amplitude: np.ndarray
-    """(g,) float32: mean of the sum of amplitudes over the frequencies."""
-    amplitude_noise: np.ndarray
-    """(g,) float32: its deviation."""
-
-
 def first_order(
     imager: AmcwImager, exposure: AmcwExposure, wanted: np.ndarray, jitter_mm: float
 ) -> FirstOrder | None:
@@ -83,7 +72,8 @@ def first_order(
     shape = exposure.shape
     n = exposure.sigma.size
     side = len(window.space)
-    unfit = pixels_within(_unfit(imager, exposure).reshape(shape), side)
+    is_by_sample = _unfit(imager, exposure)
+    unfit = pixels_within(is_by_sample.reshape(shape), side)
     if (unfit | imager.outside_mask)[wanted].mean() > MOST_LISTED:
         return None
 
@@ -130,13 +120,13 @@ def first_order(
         _EvenPixels(np.flatnonzero(is_even), even_moves),
         _UnevenPixels(uneven, uneven_moves),
     )
-    listed = listed_of(undecided.reshape(shape), imager, exposure)
+    listed = listed_of(undecided.reshape(shape), imager)
     return FirstOrder(
         imager=imager,
         shape=shape,
         linear=linear,
         listed=listed,
-        halo_noise=_halo_noise(light, metres_by_phase, listed.halo),
+        halo=halo_of(listed.halo, light, metres_by_phase, is_by_sample, exposure),
         farthest_error_m=farthest_m,
     )
 
@@ -164,20 +154,6 @@ def _metres_by_phase(imager: AmcwImager, light: Light) -> np.ndarray:
     if not imager.filter_settings.by_amplitude:
         return np.broadcast_to(metres, light.phase_noise.shape)
     return metres * light.amplitude / np.median(light.amplitude, axis=1, keepdims=True)
-
-
-def _halo_noise(light: Light, metres_by_phase: np.ndarray, halo: np.ndarray) -> HaloNoise:
-    """Return what turns readings of ``halo`` (g,) pixels into normals."""
-    light = Light._make(part.take(halo, axis=1) for part in light)
-    noise_m = metres_by_phase[:, halo] * light.phase_noise
-    shares = noise_m / np.sqrt((noise_m**2).sum(axis=0))
-    across = light.amplitude * light.phase_noise
-    along = light.amplitude * light.relative_noise
-    return HaloNoise(
-        turn_back=(np.conj(light.phasor) * shares / across).astype(np.complex64),
-        mean_amplitude=light.mean_amplitude.sum(axis=0),
-        amplitude_noise=np.sqrt((along**2).sum(axis=0)),
-    )
 
 
 def _linear(
@@ -292,8 +268,8 @@ class FirstOrder:
     """The pixels that are linear in the noise."""
     listed: Listed
     """The other wanted pixels."""
-    halo_noise: HaloNoise
-    """Noise of the pixels in the windows of the listed ones."""
+    halo: Halo
+    """Light of the pixels in the windows of the listed ones."""
     farthest_error_m: float
     """Largest displacement of a frame for which the pixels are sorted, metres."""
 
@@ -307,9 +283,7 @@ class FirstOrder:
         z_m = np.empty(n, f4)
         reason = np.full(n, Reason.VALID, np.uint8)
         amplitude = np.empty(n, f4)
-        reading = imager.reading(listed.exposure, rng)
         normals = standard_normals(rng, (2, n))
-        share_noise(reading.unit, reading.amplitude, self.halo_noise, listed.halo, normals)
         draw_linear_frame(
             self.shape,
             linear,
@@ -320,35 +294,10 @@ class FirstOrder:
             amplitude,
         )
         if listed.pixels.size:
-            of_listed = decoded(listed, imager, reading, error_m)
+            light = drawn_light(self.halo, imager, normals, rng)
+            of_listed = decoded(listed, imager, light, error_m)
             z_m[listed.pixels] = of_listed.z_m
             reason[listed.pixels] = of_listed.reason
             amplitude[listed.pixels] = of_listed.amplitude
         shape = self.shape
         return DecodedFrame(z_m.reshape(shape), reason.reshape(shape), amplitude.reshape(shape))
-
-
-@numba.njit(**FAST)
-def share_noise(unit, amplitude, noise, halo, normals):  # type: ignore[no-untyped-def]
-    """Write the normals of the phases and of the amplitudes of the list's halo, which linear pixels
-    share with it.
-
-    Args:
-        unit: (2, f, g or more) real and imaginary parts of a reading's unit phasors.
-        amplitude: (f, g or more) amplitudes of the reading.
-        noise: the `HaloNoise`.
-        halo: (g,) flat indices.
-        normals: (2, n) of the view; written at ``halo``.
-    """
-    frequencies = np.uint64(len(amplitude))
-    for x in range(np.uint64(halo.size)):
-        across = ZERO
-        total = ZERO
-        for f in range(frequencies):
-            turn_back = noise.turn_back[f, x]
-            turned = unit[1, f, x] * turn_back.real + unit[0, f, x] * turn_back.imag
-            across += turned * amplitude[f, x]
-            total += amplitude[f, x]
-        longer = total - noise.mean_amplitude[x]
-        normals[0, halo[x]] = across
-        normals[1, halo[x]] = longer / noise.amplitude_noise[x]

@@ -301,9 +301,11 @@ class AmcwImager(UnitModel[AmcwCamera]):
         frequencies_hz = np.array(self.camera.frequencies_hz)[:, None, None]
         # range errors that all frames share act as a delay of the light
         turns = frequencies_hz * (2 * self.static_error_m / SPEED_OF_LIGHT_AIR)
+        # far below one turn: their rounding moves the range by less than 1e-8 m
+        angles = (2 * np.pi * turns).astype(f4)
         delay = np.empty(phasor.shape, complex)
-        delay.real = np.cos(2 * np.pi * turns)
-        delay.imag = np.sin(2 * np.pi * turns)
+        delay.real = np.cos(angles)
+        delay.imag = np.sin(angles)
         signal = phasor * delay * (contrast * electrons)
         if not self.config.effects.wiggling:
             return signal

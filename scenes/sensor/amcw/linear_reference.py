@@ -13,7 +13,7 @@ from scenes.sensor.amcw.linear import Filtered, Moves
 NODES = ((0.0, 2 / 3), (np.sqrt(3.0), 1 / 6), (-np.sqrt(3.0), 1 / 6))  # deviations, weights
 
 
-class Window(NamedTuple):
+class PixelWindow(NamedTuple):
     """The k pixels of a window without noise; the centre, at index k // 2, has phase 0."""
 
     phase: np.ndarray
@@ -45,7 +45,7 @@ def derivatives(c: float, t: np.ndarray) -> list[np.ndarray]:
     return [value * factor for factor in over]
 
 
-def linearised_pixel(window: Window) -> tuple[Filtered, Moves]:
+def linearised_pixel(window: PixelWindow) -> tuple[Filtered, Moves]:
     """Return the filtered pixel to first order in the noise, as scalars, and (k,) its moves."""
     centre = len(window.phase) // 2
     is_neighbour = np.arange(len(window.phase)) != centre

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from scenes.sensor.amcw import kernels
-from scenes.sensor.amcw.exposure import AmcwExposure
 from scenes.sensor.amcw.imager import AmcwImager, NoisyLight
 from scenes.sensor.amcw.ranging import DepthEngine
 from scenes.sensor.amcw.windows import pixels_within, windows_of
@@ -25,60 +24,55 @@ class Listed(NamedTuple):
 
     pixels: np.ndarray
     """(p,): flat indices of the pixels whose result is wanted."""
+    columns: np.ndarray
+    """(p,): first column of the window of each."""
     halo: np.ndarray
     """(g,): flat indices of pixels whose light is needed."""
-    exposure: AmcwExposure
-    """Their samples, as a view of 1 x (g + 1) pixels. The last one is always saturated, as the
-    filter takes saturated pixels like those beyond the picture."""
     strips: np.ndarray
-    """(side, s) int32: indices in ``exposure`` of the columns of windows, run by run."""
+    """(side, s) int32: indices in ``halo`` of the columns of windows, run by run; g stands for what
+    is beyond the picture. A window begins at each of the first c = s - side + 1 columns."""
     turned: int
     """First column of the windows that are turned: their columns are rows of the picture."""
-    columns: np.ndarray
-    """(m,): first column of the window of each pixel that gets a range."""
     middles: np.ndarray
-    """(m,): index of each in ``exposure``."""
-    wanted: np.ndarray
-    """(p,): indices of ``pixels`` among those that get a range."""
+    """(c,) int32: indices in ``halo`` of the middles of windows."""
     neighbours: np.ndarray
-    """(m, 9) int32: indices of the neighbours and itself among those that get a range, -1 for
-    none."""
+    """(c, 9) int32: the windows of a pixel's neighbours and of itself, -1 for none."""
     engine: DepthEngine
-    """The depth engine of the pixels that get a range."""
+    """The depth engine of the windows' pixels; those whose window is no square of the picture are
+    outside its mask."""
 
 
-def listed_of(wanted: np.ndarray, imager: AmcwImager, exposure: AmcwExposure) -> Listed:
+def listed_of(wanted: np.ndarray, imager: AmcwImager) -> Listed:
     """Return the list for ``wanted`` (h, w) bool pixels of a view."""
     engine = imager.engine
     side = len(imager.filter_settings.space)
+    half = side // 2
     # the gate on the finished image looks at a pixel's neighbours
     ranges = wanted if engine.flying is None else pixels_within(wanted, 3)
     halo = pixels_within(ranges, side)
-    range_pixels = np.flatnonzero(ranges)
     halo_pixels = np.flatnonzero(halo)
-    number_in_range = _running_numbers(ranges, -1)
     number_in_halo = _running_numbers(halo, len(halo_pixels))
     strips, turned, columns = _strips(ranges, number_in_halo, side, len(halo_pixels))
-    of_exposure = np.append(halo_pixels, 0)
+    windows = max(strips.shape[1] - side + 1, 0)
+    middles = strips[half, half : half + windows]
+    column_of = np.full(wanted.shape, -1, np.int32)
+    column_of[ranges] = columns
+    neighbours = np.full((windows, 9), -1, np.int32)
+    if engine.flying is not None:
+        neighbours[columns] = windows_of(column_of, 3, -1, np.flatnonzero(ranges))
+    outside_mask = np.ones(windows, bool)
+    outside_mask[columns] = engine.outside_mask[ranges.ravel()]
     return Listed(
         pixels=np.flatnonzero(wanted),
+        columns=column_of[wanted],
         halo=halo_pixels,
-        exposure=AmcwExposure(
-            means=exposure.means.take(of_exposure, axis=-1),
-            sigma=exposure.sigma[of_exposure],
-            limit=np.append(exposure.limit[halo_pixels], f4(-1)),
-            time_share=exposure.time_share[of_exposure],
-            shape=(1, len(of_exposure)),
-        ),
         strips=strips,
         turned=turned,
-        columns=columns,
-        middles=strips[side // 2, columns + side // 2],
-        wanted=number_in_range[wanted],
-        neighbours=windows_of(number_in_range, 3, -1, range_pixels),
+        middles=middles,
+        neighbours=neighbours,
         engine=engine._replace(
-            geometry=engine.geometry.take(range_pixels, axis=1),
-            outside_mask=engine.outside_mask[range_pixels],
+            geometry=engine.geometry.take(np.append(halo_pixels, 0)[middles], axis=1),
+            outside_mask=outside_mask,
         ),
     )
 
@@ -134,37 +128,32 @@ def _strips_of_rows(
     return padded_numbers.ravel()[upper + below], column_numbers[padded] - half
 
 
-def decoded(
-    listed: Listed, imager: AmcwImager, reading: NoisyLight, error_m: float
-) -> DecodedFrame:
-    """Run the whole engine on a ``reading`` of the list's exposure, and return the wanted pixels
-    (p,)."""
-    strips = listed.strips
-    side = len(strips)
-    n_frequencies = len(reading.amplitude)
-    windows = strips.shape[1] - side + 1
+def decoded(listed: Listed, imager: AmcwImager, light: NoisyLight, error_m: float) -> DecodedFrame:
+    """Run the whole engine on noisy ``light`` of the list's halo and, as its last pixel, of what is
+    beyond the picture. Return the wanted pixels (p,)."""
+    n_frequencies = len(light.amplitude)
+    windows = len(listed.middles)
     filtered = np.empty((n_frequencies, 3, windows), f4)
     edge = np.empty((n_frequencies, windows), f4)
     kernels.filter_strips(
-        reading.unit,
-        reading.amplitude,
-        strips,
+        light.unit,
+        light.amplitude,
+        listed.strips,
         listed.turned,
         imager.filter_settings,
         filtered,
         edge,
     )
-    # `take` along the last axis takes a third of the time of an index
     frame = imager.decode(
-        filtered=filtered.take(listed.columns, axis=-1),
-        edge=edge.take(listed.columns, axis=-1),
-        saturated=reading.saturated[listed.middles],
+        filtered=filtered,
+        edge=edge,
+        saturated=light.saturated[listed.middles],
         engine=listed.engine,
         neighbours=listed.neighbours,
         error_m=error_m,
     )
     return DecodedFrame(
-        z_m=frame.z_m[listed.wanted],
-        reason=frame.reason[listed.wanted],
-        amplitude=frame.amplitude[listed.wanted],
+        z_m=frame.z_m[listed.columns],
+        reason=frame.reason[listed.columns],
+        amplitude=frame.amplitude[listed.columns],
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,11 +15,15 @@ from hypothesis import strategies as st
 
 from detectors.averages.average import (
     CORRELATED_PIXELS,
+    FEW_SAMPLES,
+    OTHER_SCENE,
     RECORDED,
     SAMPLED_PIXELS,
     AverageConfig,
     FrameSums,
+    _changed_share,
     average,
+    pixel_medians,
     prefix_averages,
     unsteadiness,
 )
@@ -330,6 +335,44 @@ def test_noise_is_no_other_scene(noise_m: float, blur_px: int) -> None:
     """Also far noisier than the least change, or shared by the pixels of a depth engine's filter."""
     cloud = average(heaps([0] * 6, noise_m, blur_px), RECORDED)
     assert cloud.n_frames == 6 and unsteadiness(cloud) == ""
+
+
+def test_still_blocks_are_seen_without_their_medians() -> None:
+    """The medians of blocks in NumPy decide alike, for shares of changed blocks about the limit and
+    changes about theirs."""
+    rng = np.random.default_rng(12)
+    decisions = []
+    for number in range(300):
+        share = rng.uniform(0.15, 0.5)
+        change_m = rng.choice([0.002, 0.004, 0.008])
+        first = 0.7 + rng.normal(0, 0.001, (64, 9))
+        second = first + rng.normal(0, 0.0005, (64, 9)) + (0.01 if number % 2 else 0.0)
+        changed = second[: int(share * 64)]
+        changed += rng.uniform(0.5, 1.5) * change_m * (rng.random(changed.shape) < 0.7)
+        second[rng.random(second.shape) < rng.choice([0.0, 0.4])] = np.nan
+        differences = first - second
+        counts = np.isfinite(differences).sum(axis=1)
+        medians = np.nanmedian(differences[2 * counts > 9], axis=1)
+        off_m = np.abs(medians - np.median(medians))
+        expected = np.mean(off_m > change_m) >= OTHER_SCENE
+        assert (_changed_share(first, second, change_m) >= OTHER_SCENE) == expected
+        decisions.append(expected)
+    assert 0.1 < np.mean(decisions) < 0.9
+
+
+@pytest.mark.parametrize("frames", range(1, FEW_SAMPLES + 2))
+def test_medians_of_pixels_equal_numpy(frames: int) -> None:
+    rng = np.random.default_rng(frames)
+    stack = rng.normal(size=(frames, 40, 61)).astype(np.float32)
+    stack[rng.random(stack.shape) < 0.3] = np.nan
+    stack[0, 0, :2] = (np.inf, -np.inf)
+    finite = np.where(np.isfinite(stack), stack, np.nan)
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # pixels without a sample
+        expected = np.nanmedian(finite, axis=0)
+    medians = pixel_medians(stack)
+    assert medians.dtype == np.float32
+    np.testing.assert_array_equal(medians, expected)
 
 
 def test_a_jump_of_the_range_is_no_other_scene() -> None:

@@ -17,7 +17,13 @@ from scenes.sensor.amcw.imager import AmcwImager
 from scenes.sensor.calibration import calibrated_signal_electrons, temporal_sigma_m, with_number
 from scenes.sensor.camera import camera_of, load_camera
 from scenes.sensor.common.config import NO_EFFECTS, CameraConfig
-from scenes.sensor.common.normals import normals_from_bits
+from scenes.sensor.common.normals import (
+    BLOCK,
+    LANES,
+    fill_words,
+    normals_from_words,
+    standard_normals,
+)
 from scenes.sensor.source import SimulatedUnit
 from tests.support.sensor_frames import correlation, first_frame, noise_of, true_z_m, z_of
 
@@ -144,7 +150,7 @@ def test_normals_are_normal():
     precision, and the tails."""
     bits = np.random.default_rng(8).integers(0, 2**32, 200_000, dtype=np.uint32)
     out = np.empty(200_000, f4)
-    normals_from_bits(bits, out)
+    normals_from_words(bits[:100_000], bits[100_000:], out[:100_000], out[100_000:])
     u = ((bits[:100_000] >> 8) + 0.5) / 2**24
     v = (bits[100_000:] >> 8) / 2**24
     radius = np.sqrt(-2 * np.log(u))
@@ -154,6 +160,58 @@ def test_normals_are_normal():
     assert stats.kstest(out, "norm").pvalue > 0.001
     beyond_3 = np.abs(out) > 3
     assert beyond_3.mean() == pytest.approx(2 * stats.norm.sf(3), rel=0.15)
+
+
+def xoshiro128(state: list[int], count: int) -> list[int]:
+    """Words of one generator xoshiro128++, as its authors write it."""
+    s0, s1, s2, s3 = state
+    words = []
+    for _ in range(count):
+        words.append((rotated(s0 + s3, 7) + s0) % 2**32)
+        shifted = s1 << 9
+        s2 ^= s0
+        s3 ^= s1
+        s1 ^= s2
+        s0 ^= s3
+        s2 = (s2 ^ shifted) % 2**32
+        s3 = rotated(s3, 11)
+    return words
+
+
+def rotated(word: int, bits: int) -> int:
+    word %= 2**32
+    return (word << bits | word >> (32 - bits)) % 2**32
+
+
+def test_words_are_those_of_generators_side_by_side():
+    states = np.random.default_rng(4).integers(0, 2**32, 4 * LANES, dtype=np.uint32)
+    lanes = states.reshape(4, LANES).T.tolist()
+    lanes[0] = [1, 2, 3, 4]
+    states[::LANES] = lanes[0]
+    words = np.empty(12 * LANES, np.uint32)
+    fill_words(states, words[: 4 * LANES])
+    fill_words(states, words[4 * LANES :])
+    expected = np.array([xoshiro128(lane, 12) for lane in lanes])
+    assert np.array_equal(words.reshape(12, LANES), expected.T)
+    # published for this state
+    assert expected[0, :4].tolist() == [641, 1573767, 3222811527, 3517856514]
+    assert expected[0, 8] == 495546011
+
+
+def test_standard_normals_have_no_pattern():
+    """Neither within a draw, between lanes and blocks and pairs, nor between draws; an odd count,
+    which no block fits. Correlations of 40,000 products are normal; alpha 1e-5 each."""
+    rng = np.random.default_rng(5)
+    count = 16 * BLOCK + 2 * 321 + 1
+    first = standard_normals(rng, (count,))
+    second = standard_normals(rng, (count,))
+    assert stats.kstest(np.append(first, second), "norm").pvalue > 0.001
+    limit = 4.5 / np.sqrt(count)
+    assert abs((first * second).mean()) < limit
+    for lag in (1, LANES, BLOCK, (count + 1) // 2):
+        for values in (first, first**2 - 1):
+            products = values[lag:] * values[:-lag]
+            assert abs(products.mean()) < 2 * limit * np.sqrt(count / products.size)
 
 
 @pytest.mark.parametrize("electrons", [40.0, 400.0])

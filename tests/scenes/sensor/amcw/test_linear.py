@@ -10,7 +10,7 @@ from scenes.sensor.amcw.light import Light
 from scenes.sensor.amcw.linear import Filtered, Moves, linearised, unknown_filtered
 from scenes.sensor.amcw.linear_frames import Linear, draw_linear_frame
 from scenes.sensor.amcw.linear_frames_reference import linear_frame
-from scenes.sensor.amcw.linear_reference import Window, linearised_pixel
+from scenes.sensor.amcw.linear_reference import PixelWindow, linearised_pixel
 
 f4 = np.float32
 SHAPE = (9, 11)
@@ -56,7 +56,7 @@ def filtered_by_kernel(light: Light, settings: FilterSettings) -> tuple[Filtered
     return filtered, linearised(np.arange(n), light, settings, SHAPE, filtered)
 
 
-def window_at(light: Light, settings: FilterSettings, i: int) -> Window:
+def window_at(light: Light, settings: FilterSettings, i: int) -> PixelWindow:
     """The reference's window of pixel i; pixels beyond the border repeat it, with weight 0."""
     h, w = SHAPE
     half = SIDE // 2
@@ -70,7 +70,7 @@ def window_at(light: Light, settings: FilterSettings, i: int) -> Window:
             space[q] = settings.space.ravel()[q]
     amplitude = light.amplitude[0, indices].astype(float)
     direction = light.phasor[0, indices] * np.conj(light.phasor[0, i])
-    return Window(
+    return PixelWindow(
         phase=np.angle(direction).astype(float),
         amplitude=amplitude,
         mean_amplitude=light.mean_amplitude[0, indices].astype(float),
