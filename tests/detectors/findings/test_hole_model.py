@@ -10,19 +10,12 @@ import numpy as np
 import pytest
 
 from detectors.findings import hole_model_reference as reference
-from detectors.findings.hole_model import (
-    WALL_PRIOR,
-    HolePatch,
-    _smooth,
-    _smooth_columns,
-    fit_hole,
-    lens_side,
-    pictures,
-    sandwich_covariance,
-    sight,
-    straight_sight,
-)
+from detectors.findings.blurs import smooth, smooth_columns
+from detectors.findings.hole_model import fit_hole, sandwich_covariance
+from detectors.findings.hole_patch import WALL_PRIOR, HolePatch, lens_side
+from detectors.findings.pictures import pictures
 from detectors.findings.surroundings import local_plane
+from detectors.findings.viewpoints import sight, straight_sight
 from detectors.findings.whitening import correlated_products
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
@@ -119,7 +112,7 @@ def test_a_lens_rectangle_has_the_second_moment_of_its_blur(deviation_px: float)
     these parts leave 7 %."""
     column = np.zeros((41, 1))
     column[20] = 1.0
-    _smooth_columns(column, lens_side(deviation_px), 0)
+    smooth_columns(column, lens_side(deviation_px), 0)
     moment_px2 = float(column[:, 0] @ (np.arange(41) - 20.0) ** 2)
     assert column.sum() == pytest.approx(1.0)
     error = 1e-9 if deviation_px < 0.82 else 0.07
@@ -134,10 +127,10 @@ def test_a_picture_is_smoothed_where_it_is_not_0(corner: tuple[int, int]) -> Non
     noise = np.random.default_rng(0).standard_normal((6, 7))
     image[top : top + 6, left : left + 7] = noise[: max(31 - top, 0), : max(29 - left, 0)]
     turned = image.T.copy()
-    _smooth_columns(turned, 3.7, 0)
+    smooth_columns(turned, 3.7, 0)
     whole = turned.T.copy()
-    _smooth_columns(whole, 1.25, 0)
-    _smooth(image, 3.7, 1.25)
+    smooth_columns(whole, 1.25, 0)
+    smooth(image, 3.7, 1.25)
     np.testing.assert_array_equal(image, whole)
 
 

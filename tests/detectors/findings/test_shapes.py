@@ -23,8 +23,11 @@ from detectors.findings.family import (
     mixture,
     sized,
 )
-from detectors.findings.hole_model import HoleFit, HolePatch, fit_hole, pictures, sight
+from detectors.findings.hole_model import HoleFit, fit_hole
+from detectors.findings.hole_patch import HolePatch
+from detectors.findings.pictures import pictures
 from detectors.findings.shapes import CLOSE, SCRATCH, Shape, SightLines, _see_bowl, _see_cap
+from detectors.findings.viewpoints import sight
 
 EMITTER_M = np.array([-14e-3, 0.0, 1e-3])
 FRONTAL_PX_M = np.array([[1.4e-3, 0.0, 1e-4], [0.0, 1.5e-3, -2e-4]])
