@@ -5,8 +5,9 @@ import math
 import numba
 import numpy as np
 
-from detectors.findings.hole_patch import WALL_PRIOR
+from detectors.findings.hole_patch import WALL_PRIOR, View
 from detectors.findings.pictures import drawn
+from detectors.findings.products import products_of
 from detectors.findings.shapes import DISC, SLOT
 from detectors.pixels.clusters import PLAIN
 
@@ -24,128 +25,189 @@ LONGEST = 3.0  # largest logarithm of a slot's length over its width
 
 
 @numba.njit(**PLAIN)
-def descend(  # type: ignore[no-untyped-def]
-    data,
-    pixels,
-    weight,
-    start,
-    shape,
-    sights,
-    metric,
-    blur_u,
-    blur_v,
-    soft,
-    weighing,
-    h,
-    w,
-    largest_square,
-):
-    """Return the best damage (7,) of a shape, its offset, rows (10, n) and whether the descent
-    from ``start`` (8,) has converged.
+def descend(
+    data: np.ndarray,
+    pixels: np.ndarray,
+    weight: float,
+    start: np.ndarray,
+    shape: int,
+    view: View,
+    largest_square: float,
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, bool]:
+    """Return the best damage (7,) of a shape, its offset, derivatives (8, n), the damage minus the
+    ``data`` (n,), and whether the descent from the parameters ``start`` (8,) has converged.
 
-    The first rows are derivatives of the used pixels, at flat indices ``pixels`` (n,), by (u, v,
-    radius, depth, offset, wall, stretch, angle), 0 for those that the shape lacks; the ninth is the
-    damage minus ``data`` (n,); the tenth is that of the last trial. ``weight``: of the prior.
+    The derivatives are those of the used pixels, at flat indices ``pixels`` (n,), by (u, v, radius,
+    depth, offset, wall, stretch, angle), 0 for those that the shape lacks. Where a last step that
+    gained next to nothing has made the damage a little better, they are those before it.
+    ``weight``: of the prior.
 
-    The descent ends where the sum of squares can hardly come below ``largest_square``: a step that
-    was taken has a linear model, and later steps gained at most `MOST_GAIN` times what it
-    promises."""
-    n = len(data)
+    The descent ends, without having converged, where the sum of squares can hardly come below
+    ``largest_square``: later steps gained at most `MOST_GAIN` times what the linear model promises.
+    """
+    fitted = _fitted(shape)
+    count = len(fitted)
+    derivatives = np.zeros((8, len(data)))
+    derivatives[4] = 1.0
+    slopes = np.empty((count + 1, len(data)))  # by the fitted parameters; the last row: misfit
+    misfit = slopes[count]
+    trial_misfit = np.empty(len(data))
     parameters = start
-    step = np.zeros(8)
-    damping = 10.0 * DAMPING
-    converged = False
-    square = np.inf
-    promised = np.inf
-    rows = np.zeros((10, n))
-    rows[4] = 1.0
-    products = np.eye(9)
-    best = np.zeros(7)
-    holes = np.zeros((8, 7))  # the damage, and seven with one parameter varied
-    sizes = np.zeros(7)  # of these changes
-    misfit = rows[9:]  # damage minus data of the trial, a view of the last row
-    by_parameters = np.eye(9)  # derivatives of the hole by the parameters
-    # the parameters of the damage that vary, and their rows
-    if shape == SLOT:
-        varied = np.array([0, 1, 2, 3, 5, 6])
-    elif shape == DISC:
-        varied = np.array([0, 1, 2, 3, 4])
-    else:
-        varied = np.array([0, 1, 2, 3])
-    # no disc is larger than ten patches, so that a far trial step stays finite
-    widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
-    for trial in range(MOST_STEPS + 1):
-        trial_parameters = parameters + step
-        radius = math.exp(min(max(trial_parameters[2], -20.0), widest))
-        for k in range(8):
-            holes[k, 0] = min(max(trial_parameters[0], -10.0 * w), 10.0 * w)
-            holes[k, 1] = min(max(trial_parameters[1], -10.0 * h), 10.0 * h)
-            holes[k, 2] = radius
-            holes[k, 3] = trial_parameters[3] / radius**2
-            holes[k, 4] = math.sin(0.5 * math.pi * trial_parameters[5]) ** 2
-            holes[k, 5] = min(max(trial_parameters[6], -LONGEST), LONGEST)
-            holes[k, 6] = trial_parameters[7]
-        image = drawn(
-            shape, holes[:1], sights, metric, blur_u, blur_v, soft, weighing, h, w
-        ).ravel()
-        for i in range(n):
-            misfit[0, i] = image[pixels[i]] + trial_parameters[4] - data[i]
-        prior = weight * (holes[0, 4] - WALL_PRIOR[0])
-        new_square = prior**2
-        for i in range(n):
-            new_square += misfit[0, i] ** 2
-        enough = TOLERANCE * square + SMALLEST
-        converged = promised < enough or 0.0 <= square - new_square < enough
-        is_taken = trial == 0 or new_square < square
+    hole = _damage(parameters, view)
+    square = _compare(hole, parameters[4], weight, data, pixels, shape, view, misfit)
+    damping = DAMPING
+    is_taken = True
+    for _ in range(MOST_STEPS):
         if is_taken:
-            parameters = trial_parameters
-            square = new_square
-            damping = 0.1 * damping
-            for k in range(7):
-                best[k] = holes[0, k]
-            depth = best[3]
-            sizes[0] = STEP
-            sizes[1] = STEP
-            sizes[2] = STEP * radius
-            sizes[3] = STEP * (depth if depth != 0.0 else STEP)
-            sizes[4] = -STEP if best[4] >= 0.5 else STEP
-            sizes[5] = STEP
-            sizes[6] = STEP
-            count = len(varied)
-            for k in range(count):
-                holes[k + 1, varied[k]] += sizes[varied[k]]
-            varied_holes = holes[1 : 1 + count]
-            varied_images = drawn(
-                shape, varied_holes, sights, metric, blur_u, blur_v, soft, weighing, h, w
-            )
-            images = varied_images.ravel()
-            for k in range(count):
-                row = varied[k] if varied[k] < 4 else varied[k] + 1
-                per_step = 1.0 / sizes[varied[k]]
-                for i in range(n):
-                    rows[row, i] = (images[k * h * w + pixels[i]] - image[pixels[i]]) * per_step
-            for i in range(n):
-                rows[8, i] = misfit[0, i]
-            # derivatives by the unbounded parameters, from those by the hole's own numbers
-            bend = 0.5 * math.pi * math.sin(math.pi * trial_parameters[5])
-            by_parameters[2, 2] = radius
-            by_parameters[2, 3] = -2.0 * depth
-            by_parameters[3, 3] = radius**-2.0
-            by_parameters[5, 5] = bend
-            products = np.dot(np.dot(by_parameters, np.dot(rows[:9], rows[:9].T)), by_parameters.T)
-            products[5, 5] += (weight * bend) ** 2
-            products[5, 8] += weight * bend * prior
-            if shape != SLOT:
-                products[6, 6] = 1.0
-                products[7, 7] = 1.0
-        else:
-            damping = max(10.0 * damping, 10.0 * DAMPING)
-        if converged:
-            break
+            _differentiate(hole, parameters, fitted, data, pixels, shape, view, derivatives, slopes)
+            products = _products(slopes, parameters, weight, hole, shape)
         step, promised = _damped(products, damping)
         if is_taken and square - MOST_GAIN * promised > largest_square:
             break
-    return best, parameters[4], rows, converged
+        trial = parameters.copy()
+        for k in range(count):
+            trial[fitted[k]] += step[k]
+        trial_hole = _damage(trial, view)
+        trial_square = _compare(
+            trial_hole, trial[4], weight, data, pixels, shape, view, trial_misfit
+        )
+        enough = TOLERANCE * square + SMALLEST
+        gain = square - trial_square
+        converged = promised < enough or 0.0 <= gain < enough
+        is_taken = gain > 0.0
+        if is_taken:
+            parameters = trial
+            hole = trial_hole
+            square = trial_square
+            misfit[:] = trial_misfit
+            damping = 0.1 * damping
+        else:
+            damping = max(10.0 * damping, 10.0 * DAMPING)
+        if converged:
+            return hole, parameters[4], derivatives, misfit, True
+    return hole, parameters[4], derivatives, misfit, False
+
+
+@numba.njit(**PLAIN)
+def _fitted(shape):  # type: ignore[no-untyped-def]
+    """Return the parameters of a shape that vary, of (u, v, ln radius, volume, offset, x, stretch,
+    angle)."""
+    if shape == SLOT:
+        return np.array([0, 1, 2, 3, 4, 6, 7])
+    if shape == DISC:
+        return np.array([0, 1, 2, 3, 4, 5])
+    return np.array([0, 1, 2, 3, 4])
+
+
+@numba.njit(**PLAIN)
+def _damage(parameters, view):  # type: ignore[no-untyped-def]
+    """Return the damage (7,) with these parameters (8,), so bounded that a far trial stays
+    finite."""
+    h = view.height
+    w = view.width
+    metric = view.metric_m2
+    # no disc is larger than ten patches
+    widest = math.log(10.0 * (h + w) * math.sqrt(max(metric[0, 0], metric[1, 1])))
+    radius = math.exp(min(max(parameters[2], -20.0), widest))
+    hole = np.empty(7)
+    hole[0] = min(max(parameters[0], -10.0 * w), 10.0 * w)
+    hole[1] = min(max(parameters[1], -10.0 * h), 10.0 * h)
+    hole[2] = radius
+    hole[3] = parameters[3] / radius**2
+    hole[4] = math.sin(0.5 * math.pi * parameters[5]) ** 2
+    hole[5] = min(max(parameters[6], -LONGEST), LONGEST)
+    hole[6] = parameters[7]
+    return hole
+
+
+@numba.njit(**PLAIN)
+def _compare(  # type: ignore[no-untyped-def]
+    hole,
+    offset,
+    weight,
+    data,
+    pixels,
+    shape,
+    view,
+    misfit,
+):
+    """Write the damage and its offset minus the ``data`` (n,) into ``misfit`` (n,), and return the
+    sum of squares, with that of the prior."""
+    image = drawn(shape, hole.reshape(1, 7), view).ravel()
+    square = (weight * (hole[4] - WALL_PRIOR[0])) ** 2
+    for i in range(len(data)):
+        misfit[i] = image[pixels[i]] + offset - data[i]
+        square += misfit[i] ** 2
+    return square
+
+
+@numba.njit(**PLAIN)
+def _differentiate(  # type: ignore[no-untyped-def]
+    hole,
+    parameters,
+    fitted,
+    data,
+    pixels,
+    shape,
+    view,
+    derivatives,
+    slopes,
+):
+    """Write the ``derivatives`` (8, n) by the damage's own numbers, and from them the ``slopes``
+    (p + 1, n) by the ``fitted`` (p,) parameters, whose last row is the misfit."""
+    radius = hole[2]
+    depth = hole[3]
+    steps = np.array([STEP, STEP, STEP * radius, STEP * depth, -STEP, STEP, STEP])
+    if depth == 0.0:
+        steps[3] = STEP**2
+    if hole[4] < 0.5:
+        steps[4] = STEP
+    count = len(fitted)
+    varied = np.empty((count - 1, 7))  # all but the offset
+    own = np.empty(count - 1, np.int64)  # the number of each
+    for k in range(count - 1):
+        own[k] = fitted[k] if k < 4 else fitted[k + 1] - 1
+        varied[k] = hole
+        varied[k, own[k]] += steps[own[k]]
+    images = drawn(shape, varied, view).reshape(count - 1, -1)
+    misfit = slopes[count]
+    for k in range(count - 1):
+        row = derivatives[own[k] if own[k] < 4 else own[k] + 1]
+        image = images[k]
+        per_step = 1.0 / steps[own[k]]
+        for i in range(len(data)):
+            row[i] = (image[pixels[i]] - (misfit[i] - parameters[4] + data[i])) * per_step
+    # by the unbounded parameters, from those by the damage's own numbers
+    for k in range(count):
+        slopes[k] = derivatives[fitted[k]]
+    slopes[2] = radius * derivatives[2] - 2.0 * depth * derivatives[3]
+    slopes[3] = derivatives[3] / radius**2
+    if shape == DISC:
+        slopes[5] = _bend(parameters) * derivatives[5]
+
+
+@numba.njit(**PLAIN)
+def _bend(parameters):  # type: ignore[no-untyped-def]
+    """Return the derivative of the wall, sin^2(pi x / 2), by x."""
+    return 0.5 * math.pi * math.sin(math.pi * parameters[5])
+
+
+@numba.njit(**PLAIN)
+def _products(  # type: ignore[no-untyped-def]
+    slopes,
+    parameters,
+    weight,
+    hole,
+    shape,
+):
+    """Return the normal equations (p + 1, p + 1) of ``slopes`` (p + 1, n) and the wall's prior,
+    right side last."""
+    products = products_of(slopes)
+    if shape == DISC:
+        slope = weight * _bend(parameters)
+        products[5, 5] += slope**2
+        products[5, 6] += slope * weight * (hole[4] - WALL_PRIOR[0])
+    return products
 
 
 @numba.njit(**PLAIN)

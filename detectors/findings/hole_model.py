@@ -24,8 +24,8 @@ import numpy as np
 
 from detectors.findings.descent import LEAST_M, descend
 from detectors.findings.hole_patch import WALL_PRIOR, HolePatch
+from detectors.findings.products import correlated_products, products_of
 from detectors.findings.shapes import SHAPES, Shape
-from detectors.findings.whitening import correlated_products
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class HoleFit:
     """Length of the tube over the depth, 0 to 1."""
     covariance: np.ndarray
     """(8, 8): of u, v, radius, depth, offset, wall, stretch and angle, in px, metres and radians;
-    0 for those that the shape lacks."""
+    0 for those that the shape lacks. NaN if the fit has not converged."""
     converged: bool
     shape: Shape = "disc"
     stretch: float = 0.0
@@ -85,31 +85,23 @@ def fit_hole(
     which has `WALL_PRIOR`; of a slot, its stretch and angle instead of the wall. The fourth is the
     hole's volume. The blur preserves it, so that only the radius of a small hole is
     ill-determined."""
-    blur_u, blur_v = patch.blur_px
-    height, width = patch.used.shape
     volume = depth_m * radius_m**2
     x = WALL_PRIOR[0]
     sharing = math.prod(patch.noise_px)
     per_chi_square_m2 = max(patch.noise_m, LEAST_M) ** 2 * sharing
-    hole, offset, rows, converged = descend(
+    hole, offset, derivatives, misfit, converged = descend(
         patch.residual_m[patch.used],
         np.flatnonzero(patch.used),
         patch.prior_weight,
         np.array([u, v, math.log(radius_m), volume, offset_m, x, stretch, angle_rad]),
         SHAPES.index(shape),
-        patch.sights,
-        patch.metric_m2,
-        blur_u,
-        blur_v,
-        patch.soft,
-        patch.weighing,
-        height,
-        width,
+        patch.view,
         largest_chi_square * per_chi_square_m2,
     )
-    derivatives = rows[:8]
-    misfit = rows[8]
     square = float(misfit @ misfit)
+    covariance = np.full((8, 8), np.nan)
+    if converged:
+        covariance = sandwich_covariance(patch, derivatives, square)
     u, v, radius, depth, wall, stretch, angle = hole.tolist()
     return HoleFit(
         u_px=u,
@@ -118,7 +110,7 @@ def fit_hole(
         depth_m=depth,
         offset_m=offset,
         wall=wall,
-        covariance=sandwich_covariance(patch, derivatives, square),
+        covariance=covariance,
         converged=converged,
         shape=shape,
         stretch=stretch,
@@ -146,18 +138,18 @@ def sandwich_covariance(
     count = len(derivatives)
     fitted = np.flatnonzero(derivatives.any(axis=1) | (np.arange(count) < 6))
     derivatives = derivatives[fitted]
-    columns = np.zeros((*patch.used.shape, len(fitted)))
-    columns[patch.used] = derivatives.T
+    images = np.zeros((len(fitted), *patch.used.shape))
+    images[:, patch.used] = derivatives
     blur_u, blur_v = patch.noise_px
     across = _nearest_odd(blur_u)
     down = _nearest_odd(blur_v)
     prior = np.diag(np.where(fitted == 5, patch.prior_weight**2, 0.0))
     unknown = np.full((count, count), np.nan)
     try:
-        bread = np.linalg.inv(derivatives @ derivatives.T + prior)
+        bread = np.linalg.inv(products_of(derivatives) + prior)
     except np.linalg.LinAlgError:
         return unknown
-    meat = correlated_products(columns, across, down) / (across * down)
+    meat = correlated_products(images, across, down) / (across * down)
     freedom = derivatives.shape[1] - float(np.vdot(bread, meat))
     if freedom <= 0:
         return unknown

@@ -2,11 +2,30 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 WALL_PRIOR = (0.5, 12.0**-0.5)
 """Prior mean and standard deviation of the wall, which is uniform from 0 to 1."""
+
+
+class View(NamedTuple):
+    """What a picture depends on beside the damage, as compiled functions take it: `HolePatch` has
+    the meanings."""
+
+    sights: np.ndarray
+    metric_m2: np.ndarray
+    blur_u: float
+    blur_v: float
+    soft: bool
+    brightness: float
+    half_m: float
+    lens_u: float
+    lens_v: float
+    height: int
+    """Of the picture, in pixels."""
+    width: int
 
 
 @dataclass(frozen=True)
@@ -45,10 +64,22 @@ class HolePatch:
         return self.blur_px if self.shared_px is None else self.shared_px
 
     @property
-    def weighing(self) -> tuple[float, float, float, float]:
-        """Brightness, half depth and the lens' sides as the kernels take them."""
-        lens_u, lens_v = self.lens_px
-        return self.brightness, self.half_m, lens_u, lens_v
+    def view(self) -> View:
+        """How the camera sees it, as compiled functions take it."""
+        height, width = self.used.shape
+        return View(
+            sights=self.sights,
+            metric_m2=self.metric_m2,
+            blur_u=float(self.blur_px[0]),
+            blur_v=float(self.blur_px[1]),
+            soft=self.soft,
+            brightness=float(self.brightness),
+            half_m=float(self.half_m),
+            lens_u=float(self.lens_px[0]),
+            lens_v=float(self.lens_px[1]),
+            height=height,
+            width=width,
+        )
 
     @property
     def prior_weight(self) -> float:

@@ -16,7 +16,6 @@ from detectors.findings.hole_patch import WALL_PRIOR, HolePatch, lens_side
 from detectors.findings.pictures import pictures
 from detectors.findings.surroundings import local_plane
 from detectors.findings.viewpoints import sight, straight_sight
-from detectors.findings.whitening import correlated_products
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
@@ -286,33 +285,6 @@ def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
 
 
 # ---- their parts
-
-
-@pytest.mark.parametrize(
-    "window",
-    [
-        (5, 5),
-        (1, 1),
-        (3, 7),
-    ],
-)
-def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
-    across, down = window
-    columns = np.random.default_rng(1).standard_normal((6, 19, 23))
-    padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
-    filtered = [
-        cv2.boxFilter(
-            image,
-            -1,
-            window,
-            normalize=False,
-            borderType=cv2.BORDER_CONSTANT,
-        )
-        for image in padded
-    ]
-    summed = np.stack(filtered).reshape(6, -1)
-    products = correlated_products(np.moveaxis(columns, 0, -1), across, down)
-    np.testing.assert_allclose(products, summed @ summed.T, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize("projection", ["central", "parallel"])
