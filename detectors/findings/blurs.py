@@ -12,73 +12,61 @@ from detectors.pixels.clusters import PLAIN
 @numba.njit(**PLAIN)
 def smooth(image, side_u, side_v):  # type: ignore[no-untyped-def]
     """Replace an image (h, w) by its means over rectangles of ``side_u`` x ``side_v`` pixels.
-    Beyond its edges, the image goes on as its last pixels. Most of it is 0 and stays so."""
-    top, bottom, left, right = _extent(image)
-    if bottom == 0:
-        return
-    margin_u = math.ceil(0.5 * side_u) + 1
-    margin_v = math.ceil(0.5 * side_v) + 1
-    first_row = max(top - margin_v, 0)
-    first_column = max(left - margin_u, 0)
-    window = image[first_row : bottom + margin_v, first_column : right + margin_u]
-    turned = window.T.copy()
-    smooth_columns(turned, side_u, first_column)
-    window[:] = turned.T
-    smooth_columns(window, side_v, first_row)
-
-
-@numba.njit(**PLAIN)
-def _extent(image):  # type: ignore[no-untyped-def]
-    """Return the first row and column of an image (h, w) that hold a number but 0, and the ends
-    of such rows and columns: first row, end of rows, first column, end of columns."""
+    Beyond its edges, the image goes on as its last pixels. Rows that are 0 stay so."""
     h, w = image.shape
-    top = h
-    bottom = 0
-    left = w
-    right = 0
-    for r in range(h):
-        first = 0
-        while first < w and image[r, first] == 0.0:
-            first += 1
-        if first == w:
-            continue
-        last = w - 1
-        while image[r, last] == 0.0:
-            last -= 1
-        top = min(top, r)
-        bottom = r + 1
-        left = min(left, first)
-        right = max(right, last + 1)
-    return top, bottom, left, right
-
-
-@numba.njit(**PLAIN)
-def smooth_columns(image, side, first):  # type: ignore[no-untyped-def]
-    """Replace each column of an image (h, w) by its means over ``side`` pixels, all columns at
-    once: sums along rows would wait for one another. ``first``: the row of a larger picture at
-    which the image begins, so that parts of pixels are rounded as there."""
-    h, w = image.shape
-    margin = math.ceil(0.5 * side) + 1
-    sums = np.zeros((h + 2 * margin + 1, w))
-    for r in range(h + 2 * margin):
-        pixels = image[min(max(r - margin, 0), h - 1)]
-        above = sums[r]
-        sum_row = sums[r + 1]
-        for c in range(w):
-            sum_row[c] = above[c] + pixels[c]
-    for r in range(h):
-        middle = first + r + 0.5 + margin
-        low = middle - 0.5 * side
-        high = middle + 0.5 * side
-        to_low = low - int(low)
-        to_high = high - int(high)
-        i = int(low) - first
-        j = int(high) - first
+    taps_u = _taps(side_u)
+    taps_v = _taps(side_v)
+    reach_u = len(taps_u) // 2
+    reach_v = len(taps_v) // 2
+    first, end = _rows_with_numbers(image)
+    first = max(first - reach_v, 0)
+    end = min(end + reach_v, h)
+    means = np.zeros((max(end - first, 0), w + 2 * reach_u))  # over columns, and beyond both edges
+    for r in range(first, end):
+        wide = means[r - first]
+        middle = wide[reach_u : reach_u + w]
+        for k in range(len(taps_v)):
+            row = image[min(max(r + k - reach_v, 0), h - 1)]
+            for c in range(w):
+                middle[c] += taps_v[k] * row[c]
+        wide[:reach_u] = middle[0]
+        wide[reach_u + w :] = middle[w - 1]
+    for r in range(first, end):
         row = image[r]
+        row[:] = 0.0
+        for k in range(len(taps_u)):
+            shifted = means[r - first, k : k + w]
+            for c in range(w):
+                row[c] += taps_u[k] * shifted[c]
+
+
+@numba.njit(**PLAIN)
+def _taps(side):  # type: ignore[no-untyped-def]
+    """Return the weights (odd,) of a pixel and its neighbours along one axis in the mean over
+    ``side`` pixels: those at the ends count in parts."""
+    if side <= 1.0:
+        return np.ones(1)
+    reach = math.ceil(0.5 * (side - 1.0))
+    taps = np.full(2 * reach + 1, 1.0 / side)
+    taps[0] = 0.5 * (side - (2.0 * reach - 1.0)) / side
+    taps[2 * reach] = taps[0]
+    return taps
+
+
+@numba.njit(**PLAIN)
+def _rows_with_numbers(image):  # type: ignore[no-untyped-def]
+    """Return the first row of an image that holds a number but 0, and the end of such rows."""
+    h, w = image.shape
+    first = h
+    end = 0
+    for r in range(h):
+        numbers = 0
         for c in range(w):
-            before = sums[i, c] + to_low * (sums[i + 1, c] - sums[i, c])
-            after = sums[j, c] + to_high * (sums[j + 1, c] - sums[j, c])
-            row[c] = (after - before) / side
+            numbers += image[r, c] != 0.0
+        if numbers > 0:
+            first = min(first, r)
+            end = r + 1
+    return first, end
 
 
 @numba.njit(**PLAIN)
