@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from detectors.findings.hole_patch import WALL_PRIOR, View
+from detectors.findings.hole_patch import WALL_PRIOR, CameraView
 from detectors.findings.pictures import drawn
 from detectors.findings.products import products_of
 from detectors.findings.shapes import DISC, SLOT
@@ -31,7 +31,7 @@ def descend(
     weight: float,
     start: np.ndarray,
     shape: int,
-    view: View,
+    view: CameraView,
     largest_square: float,
 ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, bool]:
     """Return the best damage (7,) of a shape, its offset, derivatives (8, n), the damage minus the

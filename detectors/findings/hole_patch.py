@@ -10,9 +10,9 @@ WALL_PRIOR = (0.5, 12.0**-0.5)
 """Prior mean and standard deviation of the wall, which is uniform from 0 to 1."""
 
 
-class View(NamedTuple):
-    """What a picture depends on beside the damage, as compiled functions take it: `HolePatch` has
-    the meanings."""
+class CameraView(NamedTuple):
+    """All that a picture depends on beside the damage, as compiled functions take it. `HolePatch`
+    has the meanings."""
 
     sights: np.ndarray
     metric_m2: np.ndarray
@@ -64,10 +64,10 @@ class HolePatch:
         return self.blur_px if self.shared_px is None else self.shared_px
 
     @property
-    def view(self) -> View:
-        """How the camera sees it, as compiled functions take it."""
+    def view(self) -> CameraView:
+        """The camera's view of it, as compiled functions take it."""
         height, width = self.used.shape
-        return View(
+        return CameraView(
             sights=self.sights,
             metric_m2=self.metric_m2,
             blur_u=float(self.blur_px[0]),

@@ -7,7 +7,7 @@ import numpy as np
 
 from detectors.findings.blurs import smooth, weigh
 from detectors.findings.drilled import painted_holes
-from detectors.findings.hole_patch import HolePatch, View
+from detectors.findings.hole_patch import CameraView, HolePatch
 from detectors.findings.shapes import DISC, SHAPES, Shape, reliefs
 from detectors.pixels.clusters import PLAIN
 
@@ -20,7 +20,7 @@ def pictures(patch: HolePatch, holes: np.ndarray, shape: Shape = "disc") -> np.n
 
 
 @numba.njit(**PLAIN)
-def drawn(shape: int, holes: np.ndarray, view: View) -> np.ndarray:
+def drawn(shape: int, holes: np.ndarray, view: CameraView) -> np.ndarray:
     """Return the `pictures` (m, h, w) of damages (m, 7) of a shape."""
     images = _averaged(shape, holes, view, view.blur_u, view.blur_v, view.soft)
     weighs_light = view.brightness > 0.0

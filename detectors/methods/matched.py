@@ -98,7 +98,7 @@ class MatchedDetector(LocalDetector):
 
     settings_type: ClassVar[type[MatchedConfig]] = MatchedConfig
     name = "matched"
-    version = 14
+    version = 15
 
     def __init__(
         self,

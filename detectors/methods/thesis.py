@@ -41,7 +41,7 @@ class ThesisDetector(ScoreMapDetector[ThesisConfig]):
 
     settings_type: ClassVar[type[ThesisConfig]] = ThesisConfig
     name = "thesis"
-    version = 10
+    version = 11
 
     @property
     def default_threshold(self) -> float | None:
