@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from detectors.findings.hole_model import HoleFit, HolePatch, fit_hole
+from detectors.findings.hole_model import HoleFit, fit_hole
+from detectors.findings.hole_patch import HolePatch
 from detectors.findings.shapes import Shape
 
 PRIOR: dict[Shape, float] = {"disc": 0.7, "cap": 0.15, "bowl": 0.15, "slot": 0.1}

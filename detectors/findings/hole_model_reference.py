@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from detectors.findings.hole_model import NODES, WALL_PRIOR, WEIGHTS, HolePatch
+from detectors.findings.drilled import NODES, WEIGHTS
+from detectors.findings.hole_patch import WALL_PRIOR, HolePatch
 from detectors.findings.shapes import Shape
 
 FINER = 8  # points along each axis of a pixel

@@ -13,9 +13,7 @@ import numpy as np
 
 from detectors.findings.extents import measure_extents
 from detectors.findings.family import DEPTH_ERROR, ShapeFit, Size, Start, sized
-from detectors.findings.hole_model import (
-    pictures,
-)
+from detectors.findings.pictures import pictures
 from detectors.findings.shapes import Shape
 from detectors.findings.surroundings import HoleModelConfig, Surroundings, surroundings_of
 from detectors.interface import Detection, Evidence, Measurement

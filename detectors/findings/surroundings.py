@@ -10,13 +10,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from detectors.findings.family import BLURS
-from detectors.findings.hole_model import (
-    HolePatch,
-    lens_side,
-    normal_of,
-    sight,
-    straight_sight,
-)
+from detectors.findings.hole_patch import HolePatch, lens_side
+from detectors.findings.viewpoints import normal_of, sight, straight_sight
 from detectors.interface import Detection, Evidence, Measurement
 from detectors.pixels.masks import grown, parts_with
 from detectors.pixels.noise import median_of, noise_sides_at, quantile_of, sigma_of

@@ -311,28 +311,3 @@ def _spread(
                     out_row[j] = (added[j] + blurred) * outer_row[j]
                 else:
                     out_row[j] = added[j] + blurred * outer_row[j]
-
-
-# --- dense covariances of few pixels ---
-
-
-def correlated_products(
-    columns: np.ndarray,
-    across: int,
-    down: int,
-) -> np.ndarray:
-    """Return S' S (p, p), where S is the columns (h, w, p), zero outside, summed over windows of
-    ``down`` x ``across`` pixels."""
-    height, width, count = columns.shape
-    padded = np.zeros((height + down - 1, width + across - 1, count))
-    padded[:height, :width] = columns
-    summed = cv2.boxFilter(
-        padded,
-        -1,
-        (across, down),
-        anchor=(across - 1, down - 1),  # windows end at their pixel
-        normalize=False,
-        borderType=cv2.BORDER_CONSTANT,
-    )
-    summed = summed.reshape(-1, count)
-    return summed.T @ summed

@@ -79,7 +79,7 @@ class LearnedDetector(MatchedDetector):
 
     settings_type: ClassVar[type[LearnedConfig]] = LearnedConfig
     name = "learned"
-    version = 3
+    version = 4
 
     def scored(
         self,

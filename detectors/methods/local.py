@@ -129,7 +129,7 @@ class LocalDetector:
 
     settings_type: ClassVar[type[FilterConfig]] = LocalConfig
     name = "local"
-    version = 7
+    version = 8
 
     def __init__(self, settings: FilterConfig) -> None:
         self.settings = settings

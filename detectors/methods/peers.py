@@ -62,7 +62,7 @@ class PlaneRansacDetector(ScoreMapDetector[PlaneRansacConfig]):
 
     settings_type: ClassVar[type[PlaneRansacConfig]] = PlaneRansacConfig
     name = "plane_ransac"
-    version = 5
+    version = 6
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |residual| / deviation in the crop. Raises UserError if its points determine no
@@ -135,7 +135,7 @@ class M3c2Detector(ScoreMapDetector[M3c2Config]):
 
     settings_type: ClassVar[type[M3c2Config]] = M3c2Config
     name = "m3c2"
-    version = 5
+    version = 6
 
     def analyse(self, cloud: Cloud) -> Evidence:
         """Score |distance| / deviation in the crop. Raises UserError if no point has a
@@ -305,7 +305,7 @@ class FpfhMemoryDetector(ScoreMapDetector[FpfhMemoryConfig]):
 
     settings_type: ClassVar[type[FpfhMemoryConfig]] = FpfhMemoryConfig
     name = "fpfh_memory"
-    version = 5
+    version = 6
 
     def __init__(
         self,

@@ -10,20 +10,12 @@ import numpy as np
 import pytest
 
 from detectors.findings import hole_model_reference as reference
-from detectors.findings.hole_model import (
-    WALL_PRIOR,
-    HolePatch,
-    _smooth,
-    _smooth_columns,
-    fit_hole,
-    lens_side,
-    pictures,
-    sandwich_covariance,
-    sight,
-    straight_sight,
-)
+from detectors.findings.blurs import smooth
+from detectors.findings.hole_model import fit_hole, sandwich_covariance
+from detectors.findings.hole_patch import WALL_PRIOR, HolePatch, lens_side
+from detectors.findings.pictures import pictures
 from detectors.findings.surroundings import local_plane
-from detectors.findings.whitening import correlated_products
+from detectors.findings.viewpoints import sight, straight_sight
 
 PER_PX_M = np.array([[1.4e-3, 0.0, 1.5e-4], [0.0, 1.4e-3, -2.0e-4]])
 CENTRE_M = np.array([0.03, -0.02, 0.7])
@@ -119,7 +111,7 @@ def test_a_lens_rectangle_has_the_second_moment_of_its_blur(deviation_px: float)
     these parts leave 7 %."""
     column = np.zeros((41, 1))
     column[20] = 1.0
-    _smooth_columns(column, lens_side(deviation_px), 0)
+    smooth(column, 1.0, lens_side(deviation_px))
     moment_px2 = float(column[:, 0] @ (np.arange(41) - 20.0) ** 2)
     assert column.sum() == pytest.approx(1.0)
     error = 1e-9 if deviation_px < 0.82 else 0.07
@@ -128,17 +120,25 @@ def test_a_lens_rectangle_has_the_second_moment_of_its_blur(deviation_px: float)
 
 @pytest.mark.parametrize("corner", [(12, 9), (0, 0), (28, 25), (40, 40)])
 def test_a_picture_is_smoothed_where_it_is_not_0(corner: tuple[int, int]) -> None:
-    """To the last bit as the whole, in the middle, at the edges, and without anything."""
+    """As the mean of a picture of small parts of pixels, in the middle, at the edges, and without
+    anything."""
     top, left = corner
     image = np.zeros((31, 29))
     noise = np.random.default_rng(0).standard_normal((6, 7))
     image[top : top + 6, left : left + 7] = noise[: max(31 - top, 0), : max(29 - left, 0)]
-    turned = image.T.copy()
-    _smooth_columns(turned, 3.7, 0)
-    whole = turned.T.copy()
-    _smooth_columns(whole, 1.25, 0)
-    _smooth(image, 3.7, 1.25)
-    np.testing.assert_array_equal(image, whole)
+    # pixels of 20 x 20 parts; sides of 3.7 x 1.2 pixels are 74 x 24 of them
+    parts = np.kron(np.pad(image, 4, mode="edge"), np.ones((20, 20)))
+    sums = np.pad(parts.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    rows = 20 * np.arange(4, 35) + 10
+    columns = 20 * np.arange(4, 33) + 10
+    expected = (
+        sums[np.ix_(rows + 12, columns + 37)]
+        - sums[np.ix_(rows + 12, columns - 37)]
+        - sums[np.ix_(rows - 12, columns + 37)]
+        + sums[np.ix_(rows - 12, columns - 37)]
+    ) / (74 * 24)
+    smooth(image, 3.7, 1.2)
+    np.testing.assert_allclose(image, expected, atol=1e-11)
 
 
 def pixels_of(patch: HolePatch, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -293,33 +293,6 @@ def test_a_sandwich_without_freedom_or_rank_is_not_a_number() -> None:
 
 
 # ---- their parts
-
-
-@pytest.mark.parametrize(
-    "window",
-    [
-        (5, 5),
-        (1, 1),
-        (3, 7),
-    ],
-)
-def test_correlated_products_equal_box_filters(window: tuple[int, int]) -> None:
-    across, down = window
-    columns = np.random.default_rng(1).standard_normal((6, 19, 23))
-    padded = np.pad(columns, ((0, 0), (down - 1, down - 1), (across - 1, across - 1)))
-    filtered = [
-        cv2.boxFilter(
-            image,
-            -1,
-            window,
-            normalize=False,
-            borderType=cv2.BORDER_CONSTANT,
-        )
-        for image in padded
-    ]
-    summed = np.stack(filtered).reshape(6, -1)
-    products = correlated_products(np.moveaxis(columns, 0, -1), across, down)
-    np.testing.assert_allclose(products, summed @ summed.T, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize("projection", ["central", "parallel"])

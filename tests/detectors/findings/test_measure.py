@@ -12,8 +12,9 @@ from pydantic import ValidationError
 
 from detectors.findings.extents import extents
 from detectors.findings.family import BLURS
-from detectors.findings.hole_model import HolePatch, pictures, sight
+from detectors.findings.hole_patch import HolePatch
 from detectors.findings.measure import _modelled, measure_detection
+from detectors.findings.pictures import pictures
 from detectors.findings.surroundings import (
     HoleModelConfig,
     _blurs_of,
@@ -21,6 +22,7 @@ from detectors.findings.surroundings import (
     blur_in_cells,
     surroundings_of,
 )
+from detectors.findings.viewpoints import sight
 from detectors.interface import Detection, Evidence, Measurement
 from harness.vocabulary.geometry import Cloud, MapViews, Region
 

@@ -23,8 +23,11 @@ from detectors.findings.family import (
     mixture,
     sized,
 )
-from detectors.findings.hole_model import HoleFit, HolePatch, fit_hole, pictures, sight
-from detectors.findings.shapes import Shape
+from detectors.findings.hole_model import HoleFit, fit_hole
+from detectors.findings.hole_patch import HolePatch
+from detectors.findings.pictures import pictures
+from detectors.findings.shapes import CLOSE, SCRATCH, Shape, SightLines, _see_bowl, _see_cap
+from detectors.findings.viewpoints import sight
 
 EMITTER_M = np.array([-14e-3, 0.0, 1e-3])
 FRONTAL_PX_M = np.array([[1.4e-3, 0.0, 1e-4], [0.0, 1.5e-3, -2e-4]])
@@ -63,6 +66,30 @@ def test_a_picture_is_that_of_the_reference(
     expected_m = reference.relief(patch, numbers, shape)
     np.testing.assert_allclose(image_m, expected_m, atol=0.02 * abs(depth_m))
     assert image_m.sum() == pytest.approx(expected_m.sum(), rel=0.015)
+
+
+@pytest.mark.parametrize("shape", ["cap", "bowl"])
+@pytest.mark.parametrize("deepest_m", [4e-3, -4e-3, 30e-3])
+def test_a_line_of_sight_ends_on_the_relief(shape: Shape, deepest_m: float) -> None:
+    """At the depth t, a line is at its point minus t times the drift, where the relief has this
+    depth; a cap of 30 mm is deeper than its rim's radius."""
+    lines = SightLines(-0.013, 0.002, 7e-4, -1e-4, 0.12, -0.2)
+    depths_m = np.empty(36)
+    if shape == "cap":
+        _see_cap(lines, 12e-3, deepest_m, depths_m)
+    else:
+        _see_bowl(lines, 12e-3, deepest_m, np.empty((SCRATCH, 36)), depths_m)
+    steps = np.arange(36)
+    first_m = np.array([lines.along, lines.across])
+    step_m = np.array([lines.step_along, lines.step_across])
+    points_m = first_m + steps[:, None] * step_m
+    met_m = points_m - depths_m[:, None] * np.array([lines.drift_along, lines.drift_across])
+    expected_m = reference._height_m(met_m, 12e-3, deepest_m, 1.0, shape)
+    inside = np.hypot(*points_m.T) < 12e-3
+    error_m = 1e-12 if shape == "cap" else CLOSE * abs(deepest_m)
+    np.testing.assert_allclose(depths_m[inside], expected_m[inside], atol=error_m)
+    np.testing.assert_array_equal(depths_m[~inside], 0.0)
+    assert 10 < inside.sum() < 36
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from detectors.findings.whitening import (
     LONGEST_LAG_PX,
     _spread,
     centred,
-    correlated_products,
     covariance_product,
     filters,
     grid_of,
@@ -292,21 +291,6 @@ def test_scores_are_the_likelihoods_where_pixels_are_missing() -> None:
         assert abs((template * rough).sum() / energy**0.5 - exact) < 2.0 * CONVERGED
         # a part of the template is hidden
         assert 0.6 * worth.energy < energy < 1.02 * worth.energy
-
-
-@pytest.mark.parametrize(("across", "down"), [(1, 1), (3, 2), (2, 5)])
-def test_products_of_columns_count_their_sums_over_windows(across: int, down: int) -> None:
-    """Beside the sums of each window that overlaps the columns, one by one."""
-    columns = np.random.default_rng(9).standard_normal((7, 6, 3))
-    padded = np.pad(columns, ((down - 1, down - 1), (across - 1, across - 1), (0, 0)))
-    sums = []
-    for row in range(7 + down - 1):
-        for column in range(6 + across - 1):
-            window = padded[row : row + down, column : column + across]
-            sums.append(window.sum(axis=(0, 1)))
-    stacked = np.array(sums)
-    result = correlated_products(columns, across, down)
-    np.testing.assert_allclose(result, stacked.T @ stacked, rtol=1e-12)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.8])

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detectors.findings.hole_model import lens_side, straight_sight
+from detectors.findings.hole_patch import lens_side
 from detectors.findings.surroundings import HoleModelConfig, _lens_sides, blur_in_cells
+from detectors.findings.viewpoints import straight_sight
 from detectors.interface import Detection
 from detectors.methods.thesis import ThesisConfig, ThesisDetector
 from detectors.views.mapping.merge import merge
