@@ -1,4 +1,4 @@
-"""Whether the picture moved across the image between two frames of one recording.
+"""Pictures that move across the image between two frames of one recording.
 
 The whole range does not jump where a camera slides along a flat part, so frames still belong to one
 scene by their distances; but the mean smears all damage. Each frame's relief is correlated with the
