@@ -70,6 +70,10 @@ ALONE_PX = 7  # half of the square in which a peak is the highest
 OWN_SHARE = 0.75
 """A loud part whose score is less than this share of another's nearby is judged once that one is
 removed: wide templates see both."""
+WHOLE_SHARE = 0.01
+"""A loud part whose score is less than this share of the picture's highest is judged once that one
+is removed: the whitening is solved in single precision, and leaves up to a thousandth of the
+highest score anywhere in the picture."""
 
 # --- scores ---
 
@@ -206,13 +210,17 @@ class MatchedDetector(LocalDetector):
 
 
 def _with_missing(cloud: Cloud, evidence: LocalEvidence) -> LocalEvidence:
-    """Return the evidence with what missing pixels around each pixel add to its score."""
+    """Return the evidence with what missing pixels around each cell add to its score: the most
+    that they add at one of its pixels, so that all of its pixels keep one score."""
     missing = missing_evidence(cloud, evidence)
     if missing is None:
         return evidence
-    score = np.sqrt(evidence.score**2 + missing)
     scored = evidence.cell >= 0
     cells = evidence.cell[scored]
+    missing_of_cell = np.zeros(evidence.signed.size)
+    np.maximum.at(missing_of_cell, cells, missing[scored])
+    score = np.full_like(evidence.score, np.nan)
+    score[scored] = np.sqrt(evidence.score[scored] ** 2 + missing_of_cell[cells])
     signed = evidence.signed.copy()
     flat = signed.ravel()
     flat[cells] = np.copysign(score[scored], flat[cells])
@@ -366,8 +374,9 @@ def _cores(
     known: np.ndarray,
 ) -> list[_Core]:
     """Return the strong findings: connected loud parts of the values (r, c) with a score (r, c) of
-    their sign above `STRONG`, and at least `OWN_SHARE` of those of loud parts nearby, whose
-    template, of ``radius_px`` (r, c), has a disc that they fill by half."""
+    their sign above `STRONG`, at least `OWN_SHARE` of those of loud parts nearby and `WHOLE_SHARE`
+    of the strongest finding's, whose template, of ``radius_px`` (r, c), has a disc that they fill
+    by half."""
     loud = known & (np.abs(values) > LOUD_SIGMAS)
     smooth = cv2.blur(values * known, (3, 3))
     smooth = smooth / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 0.1)
@@ -393,4 +402,6 @@ def _cores(
         heights = np.where(np.abs(heights) > LOUD_SIGMAS, heights, one_sided)
         scores = score * heights / np.abs(heights).max()
         cores.append(_Core(cut, inside, scores, peak))
-    return cores
+    strengths = [abs(float(signed[core.peak])) for core in cores]
+    least = WHOLE_SHARE * max(strengths, default=0.0)
+    return [core for core, strength in zip(cores, strengths, strict=True) if strength >= least]

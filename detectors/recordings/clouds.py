@@ -7,6 +7,7 @@ many pixels, or by a common sensor size on which x/z and y/z rise evenly."""
 
 import codecs
 import io
+import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,8 @@ POINT_LISTS = (".xyz", ".asc", ".pts", ".txt", ".csv")
 RASTER_CORRELATION = 0.999
 """Correlation of x/z with the column and y/z with the row on a true pixel grid; a distorted lens
 reduces it by 1 %."""
+ORDER_SAMPLES = 8192  # points whose places tell whether their order is that of a pixel grid
+LEAST_SIDE_PX = 32  # of a picture cut out of a larger one
 
 
 class Points(NamedTuple):
@@ -95,15 +98,30 @@ def _grid_of(points: np.ndarray, lens: Lens | None = None) -> tuple[int, int]:
     valid = np.isfinite(points).all(axis=1) & (points[:, 2] != 0)
     if valid.sum() < 100:
         return 1, count
-    for width, height in SENSOR_SIZES:
-        if width * height == count:
-            v, u = np.divmod(np.arange(count), width)
-            slopes = points[valid, :2] / points[valid, 2, None]
-            across = np.corrcoef(slopes[:, 0], u[valid])[0, 1]
-            down = np.corrcoef(slopes[:, 1], v[valid])[0, 1]
-            if min(abs(across), abs(down)) > RASTER_CORRELATION:
-                return height, width
+    indices = np.flatnonzero(valid)
+    if len(indices) > ORDER_SAMPLES:
+        # not every n-th one: these may all lie in a few columns
+        indices = np.random.default_rng(0).choice(indices, ORDER_SAMPLES, replace=False)
+    slopes = points[indices, :2].astype(np.float64) / points[indices, 2, None]
+    if not (np.isfinite(slopes).all() and np.ptp(slopes, axis=0).all()):
+        return 1, count
+    for width, height in _sizes_of(count):
+        v, u = np.divmod(indices, width)
+        across = np.corrcoef(slopes[:, 0], u)[0, 1]
+        down = np.corrcoef(slopes[:, 1], v)[0, 1]
+        if min(abs(across), abs(down)) > RASTER_CORRELATION:
+            return height, width
     return 1, count
+
+
+def _sizes_of(count: int) -> list[tuple[int, int]]:
+    """Return the widths and heights of pictures with so many pixels: those of usual cameras first,
+    then those of crops."""
+    sizes = [size for size in SENSOR_SIZES if size[0] * size[1] == count]
+    for side in range(LEAST_SIDE_PX, math.isqrt(count) + 1):
+        if count % side == 0:
+            sizes += [(count // side, side), (side, count // side)]
+    return sizes
 
 
 LEGAL_CLOUD = (

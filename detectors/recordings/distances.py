@@ -315,7 +315,7 @@ def scale_in(statements: dict[str, Any], median: float) -> float | None:
 
 def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int, int]) -> Unit:
     """Return the unit of numbers (n,) if nothing states it. ``size``: width and height of the
-    image.
+    image. Floating-point numbers count as integers if they are all whole, and too large for metres.
 
     Each of `READINGS` is weighted by how common it is and by the distance that it gives the
     nearest tenth of the points, which usually holds the target (`USUAL_M`). A common divisor of
@@ -325,7 +325,10 @@ def decided_unit(name: str, stored: np.ndarray, usual_m: float, size: tuple[int,
     sample = stored[:: max(1, stored.size // 50_000)]
     foreground = float(np.quantile(sample, 0.1))
     median = float(np.quantile(sample, 0.5))
-    integers = usual_m == UNITS_M["mm"]
+    is_whole = bool((stored == np.rint(stored)).all())
+    integers = usual_m == UNITS_M["mm"] or (is_whole and median > FARTHEST_M)
+    if integers:
+        usual_m = UNITS_M["mm"]
     divisor = int(np.gcd.reduce(stored.astype(np.int64))) if integers else 1
     weights = {}
     for unit in READINGS:

@@ -178,9 +178,13 @@ def _opened(paths: list[Path], options: CaptureOptions) -> Recording:
         raise UserError(problem, legal=LEGAL_FORMATS)
     if suffix in (".bin", ".raw", ".dat"):
         raise raw_layout_of(path)
-    fix = CONVERT.get(suffix, "").replace("FILE", str(path)) or None
     problem = f"{path}: files of the type '{suffix}' are not read"
-    raise UserError(problem, legal=LEGAL_FORMATS, fix=fix)
+    raise UserError(problem, legal=LEGAL_FORMATS, fix=_conversion_of(path))
+
+
+def _conversion_of(path: Path) -> str | None:
+    """Return how a file of a type that is not read becomes one that is; None if that is unknown."""
+    return CONVERT.get(path.suffix.lower(), "").replace("FILE", str(path)) or None
 
 
 def _opener_of(path: Path, options: CaptureOptions) -> Opener | None:
@@ -252,6 +256,8 @@ def _no_capture(folder: Path, inside: Sequence[Path]) -> UserError:
     if captures:
         several = "one of " if len(captures) > 1 else ""
         fix = f"name {several}{', '.join(captures[:HELD])}"
+    else:
+        fix = next(filter(None, map(_conversion_of, inside)), None)
     return UserError(problem, legal=LEGAL_FORMATS, fix=fix)
 
 

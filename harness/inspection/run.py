@@ -17,6 +17,7 @@ import numpy as np
 from detectors.averages.average import RECORDED, average, unsteadiness
 from detectors.averages.flat_agreement import places_doubt, refuse_unfit
 from detectors.averages.flat_field import FlatField, corrected, doubts, load_flat_field
+from detectors.averages.moved import motion_doubt
 from detectors.crop import Choice, NoCrop
 from detectors.interface import Detector, Evidence
 from detectors.pixels.noise import REACH_FRAMES, with_noise
@@ -145,7 +146,7 @@ def inspected(arguments: argparse.Namespace) -> Inspection:
     evidence = candidate.evidence
     if capture.mapped is None:
         evidence = _with_pieces(evidence, capture.cloud, capture.choices[0])
-    capture_doubts = _capture_doubts(arguments, capture.views, capture.flat_field)
+    capture_doubts = _capture_doubts(arguments, capture)
     evidence = replace(evidence, warnings=(*capture_doubts, *evidence.warnings))
     result = judged(candidate.detector, capture.cloud, evidence, candidate.threshold)
     outline = _outline(capture.choices, capture.mapped)
@@ -426,13 +427,15 @@ def _averaged(
     return corrected_cloud
 
 
-def _capture_doubts(
-    arguments: argparse.Namespace, views: Sequence[View], flat_field: FlatField | None
-) -> list[str]:
+def _capture_doubts(arguments: argparse.Namespace, capture: _Captured) -> list[str]:
     """Return doubts about the frames of the views and about the flat field, each once."""
-    texts = [unsteadiness(view.cloud) for view in views]
+    texts = []
+    for recording, view in zip(capture.recordings, capture.views, strict=True):
+        texts.append(unsteadiness(view.cloud))
+        texts.append(motion_doubt(recording.frames(), view.cloud, recording.z_step_m))
+    flat_field = capture.flat_field
     if flat_field is not None:
-        for view in views:
+        for view in capture.views:
             texts += doubts(view.cloud, flat_field, arguments.flat_field)
             texts.append(places_doubt(view.cloud, flat_field, arguments.flat_field))
     return [text for text in dict.fromkeys(texts) if text]

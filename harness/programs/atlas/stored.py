@@ -161,7 +161,7 @@ def read_atlas(path: Path) -> list[CameraLimits]:
         if data["version"] != VERSION:
             raise ValueError(f"its version is {data['version']!r}, not {VERSION}")
         shards = [shard_of(camera, stored) for camera, stored in data["cameras"].items()]
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
         problem = f"{path}: cannot be read as an atlas: {error!r}"
         raise UserError(problem, legal=LEGAL) from error
     if not shards:

@@ -144,6 +144,20 @@ def test_missing_pixels_add_to_a_faint_depth_and_alone_are_no_finding() -> None:
     assert highest == pytest.approx(depth_only, abs=0.3)
 
 
+def test_pixels_of_one_cell_share_a_score_where_some_are_missing() -> None:
+    """Noise that reaches over 15 pixels: cells of 3 x 3 pixels, whose missing ones add to the
+    score of the whole cell; so a threshold parts no cell."""
+    gone = np.random.default_rng(5).random(SHAPE) < 0.03
+    cloud = replace(without(cloud_of(3e-4 * blurred(15)), gone), noise_reach_px=15.0)
+    evidence = DETECTOR.analyse(cloud)
+    is_scored = evidence.cell >= 0
+    cells = evidence.cell[is_scored]
+    assert len(np.unique(cells)) < 0.2 * len(cells)
+    scores = np.abs(evidence.signed.ravel()[cells])
+    np.testing.assert_array_equal(evidence.score[is_scored], scores)
+    assert DETECTOR.find(cloud, evidence, 0.5)
+
+
 def test_light_along_the_rim_is_no_finding() -> None:
     """The outer three rows stand three deviations before the surface, as where a floor's light
     comes back."""
@@ -411,6 +425,19 @@ def test_a_loud_part_is_judged_by_its_own_score(beside: float, count: int) -> No
     scores[20, 21] = 40.0
     is_known = np.ones(values.shape, bool)
     assert len(_cores(scores, np.full(values.shape, 3.2), values, is_known)) == count
+
+
+@pytest.mark.parametrize(("weak", "count"), [(7.0, 1), (9.9, 1), (10.1, 2)])
+def test_a_part_much_weaker_than_the_strongest_waits(weak: float, count: int) -> None:
+    """Errors of the whitening are a share of the picture's strongest score, wherever that is."""
+    first = disc_at(20, 10)
+    second = disc_at(20, 40)
+    values = (9.0 * (first | second)).astype(np.float32)
+    scores = (1000.0 * first + weak * second).astype(np.float32)
+    is_known = np.ones(values.shape, bool)
+    cores = _cores(scores, np.full(values.shape, 3.2), values, is_known)
+    assert len(cores) == count
+    assert first[cores[0].peak]
 
 
 def test_less_noise_finds_no_fewer_of_holes_that_stand_close() -> None:

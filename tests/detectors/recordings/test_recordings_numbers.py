@@ -425,6 +425,18 @@ def test_points_of_a_sensors_size_fill_its_grid_if_enough_are_valid(valid, has_g
     assert _grid_of(sparse) == ((120, 160) if has_grid else (1, 19_200))
 
 
+@pytest.mark.parametrize(("shape", "has_grid"), [((90, 151), True), ((31, 200), False)])
+def test_points_of_a_crop_in_rows_fill_its_grid(shape: tuple[int, int], has_grid: bool) -> None:
+    """A crop has no sensor's size; one with fewer than 32 rows is not taken for a picture."""
+    v, u = np.indices(shape).reshape(2, -1)
+    z = 0.9 + 1e-3 * np.random.default_rng(7).standard_normal(len(u))
+    points = np.stack([0.002 * (u - 30) * z, 0.002 * (v - 400) * z, z], axis=1)
+    points[::50] = np.nan
+    assert _grid_of(points) == (shape if has_grid else (1, len(u)))
+    shuffled = np.random.default_rng(8).permutation(points)
+    assert _grid_of(shuffled) == (1, len(u))
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_points_in_another_order_fill_no_grid(axis: int) -> None:
     """The correlation with the column, and with the row, must exceed 0.999 each."""
@@ -445,6 +457,15 @@ def test_numbers_for_which_no_unit_is_plausible_are_refused() -> None:
     for stored in (np.full(500, 3e7), np.full(500, 1e-6)):
         with pytest.raises(UserError, match="no usual unit is plausible"):
             decided_unit("x", stored, 1.0, (64, 48))
+
+
+def test_whole_numbers_beyond_metres_are_integers_also_as_floating_point() -> None:
+    stored = 247.0 + np.arange(2000) % 9
+    unit = decided_unit("x", stored, 1.0, (380, 300))
+    assert (unit.scale_m, unit.warning) == (1e-3, "")
+    assert "others are possible" in decided_unit("x", stored + 0.25, 1.0, (380, 300)).warning
+    # a plane at exactly 2 m is one of metres
+    assert decided_unit("x", np.full(500, 2.0), 1.0, (64, 48)).scale_m == 1.0
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,8 @@ def test_a_folder_of_captures_names_them(tmp_path: Path) -> None:
     assert (
         refusal(tmp_path).splitlines()[0] == f"{tmp_path}: contains no capture; it holds notes.txt"
     )
+    (tmp_path / "scan.e57").touch()
+    assert "to do: export its points as PLY" in refusal(tmp_path)
     bag = bags.write_bag(tmp_path / "left", bags.clouds(1))
     second = tmp_path / "other.mkv"
     second.touch()

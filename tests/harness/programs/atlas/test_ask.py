@@ -224,6 +224,7 @@ def test_an_own_camera_is_answered_by_the_camera_of_its_numbers(
         ('"version": 2', '"version": 1', "its version is 1"),
         ('"degrees": ', '"degrees": -', "degrees holds"),
         ('"coefficients": [', '"coefficients": [1.0, ', "coefficients has another shape"),
+        ('"coefficients": [', f'"coefficients": [1{"0" * 400}, ', "too large to convert"),
         ('"scatter": ', '"scatter": -', "scatter holds -"),
         ('"focal_px": 500.0', '"focal_px": "x"', "focal_px holds 'x'"),
         ("[0.3, 0.6", "[0.9, 0.6", "do not ascend"),
