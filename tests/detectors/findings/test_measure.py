@@ -13,7 +13,12 @@ from pydantic import ValidationError
 from detectors.findings.extents import extents
 from detectors.findings.family import BLURS
 from detectors.findings.hole_model import HolePatch, pictures, sight
-from detectors.findings.measure import _modelled, measure_detection
+from detectors.findings.measure import (
+    CONTOUR_ZOOM,
+    _contour_depth,
+    _modelled,
+    measure_detection,
+)
 from detectors.findings.surroundings import (
     HoleModelConfig,
     _blurs_of,
@@ -462,6 +467,31 @@ def test_a_deep_hole_falls_back_to_its_contour() -> None:
     assert m.model_depth_m == pytest.approx(0.2, abs=1e-3)
 
 
+def test_the_error_of_a_contours_depth_is_half_of_what_the_median_lacks_and_the_noise() -> None:
+    """Three pixels lie 3, 5 and 11 mm beyond the offset; the peak of 11 mm exceeds their median by
+    6 mm."""
+    cloud, evidence = Board(12.7, 12.7).seen(0.1, 1)
+    around = surroundings_of(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
+    assert around is not None
+    residual_m = np.full(around.detected.shape, 0.9)
+    residual_m[4, 4:7] = [4e-3, 6e-3, 12e-3]
+    pixels = np.zeros(residual_m.shape, bool)
+    pixels[4, 4:7] = True
+    inside = np.kron(pixels, np.ones((CONTOUR_ZOOM, CONTOUR_ZOOM))) > 0
+    patch = replace(around.patch, residual_m=residual_m, noise_m=0.4e-3)
+    behind = replace(around, patch=patch, offset_m=1e-3, peak_m=11e-3, sign=1.0)
+    depth_m, error_m = _contour_depth(behind, inside, residual_m)
+    assert depth_m == 11e-3
+    assert error_m == pytest.approx(math.hypot(3e-3, 0.4e-3))
+
+    mirrored = replace(patch, residual_m=-residual_m)
+    in_front = replace(behind, patch=mirrored, offset_m=-1e-3, sign=-1.0)
+    assert _contour_depth(in_front, inside, residual_m) == (-depth_m, error_m)
+
+    nothing_inside = np.zeros_like(inside)
+    assert math.isnan(_contour_depth(behind, nothing_inside, residual_m)[1])
+
+
 def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_through() -> None:
     # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5
     # m behind
@@ -619,7 +649,8 @@ def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     )
     assert m.points == 1
     assert m.extent_diameter_m == 0.0
-    assert m.model_note != "" or m.model_diameter_se_m > 0.15 * m.model_diameter_m
+    assert m.model_note.startswith("the blur hides the difference between diameter and depth")
+    assert m.model_diameter_se_m > 0.5 * m.model_diameter_m
 
 
 def test_an_even_blur_is_refused() -> None:
