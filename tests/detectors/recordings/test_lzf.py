@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 
 from detectors.recordings.lzf import unpack
+from tests.support.recorded_plane import lzf_literals
 
 RANDOM = np.random.default_rng(1).integers(0, 256, 9000, dtype=np.uint8).tobytes()
-
-
-def as_they_are(plain: bytes) -> bytes:
-    """Bytes in runs of at most 32, each behind its length less one."""
-    runs = [plain[start : start + 32] for start in range(0, len(plain), 32)]
-    return b"".join(bytes([len(run) - 1]) + run for run in runs)
 
 
 def copied(length: int, back: int) -> bytes:
@@ -22,33 +17,33 @@ def copied(length: int, back: int) -> bytes:
     return bytes([7 << 5 | high, length - 9, low])
 
 
-def test_bytes_are_taken_as_they_are() -> None:
-    assert unpack(as_they_are(RANDOM[:75]), 75) == RANDOM[:75]
+def test_bytes_are_taken_lzf_literals() -> None:
+    assert unpack(lzf_literals(RANDOM[:75]), 75) == RANDOM[:75]
 
 
 @pytest.mark.parametrize("length", [3, 8, 9, 256])
 @pytest.mark.parametrize("back", [256, 257, 4097, 8192])
 def test_bytes_are_repeated_from_far_before(length: int, back: int) -> None:
-    packed = as_they_are(RANDOM) + copied(length, back)
+    packed = lzf_literals(RANDOM) + copied(length, back)
     start = len(RANDOM) - back
     assert unpack(packed, len(RANDOM) + length) == RANDOM + RANDOM[start : start + length]
 
 
 def test_a_repetition_may_overlap_what_it_writes() -> None:
-    packed = as_they_are(b"abc") + copied(8, 2)
+    packed = lzf_literals(b"abc") + copied(8, 2)
     assert unpack(packed, 11) == b"abc" + b"bcbcbcbc"
 
 
 @pytest.mark.parametrize(
     "packed",
     [
-        as_they_are(b"abcd")[:-1],
-        as_they_are(b"abcd") + copied(4, 4)[:1],
-        as_they_are(b"abcd") + copied(20, 4)[:1],
-        as_they_are(b"abcd") + copied(20, 4)[:2],
-        as_they_are(b"abcd") + copied(4, 5),
-        as_they_are(b"abcd") + copied(5, 4),
-        as_they_are(b"abcd"),
+        lzf_literals(b"abcd")[:-1],
+        lzf_literals(b"abcd") + copied(4, 4)[:1],
+        lzf_literals(b"abcd") + copied(20, 4)[:1],
+        lzf_literals(b"abcd") + copied(20, 4)[:2],
+        lzf_literals(b"abcd") + copied(4, 5),
+        lzf_literals(b"abcd") + copied(5, 4),
+        lzf_literals(b"abcd"),
     ],
     ids=[
         "a run ends early",

@@ -202,7 +202,10 @@ def test_colour_lies_on_the_depth_pixels(
     np.testing.assert_array_equal(next(opened(tmp_path).frames()).rgb, plane.rgb())
 
 
-@pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
+@pytest.mark.parametrize(
+    ("write", "suffix"),
+    ((plane.write_ply, "ply"), (plane.write_pcd, "pcd"), (plane.write_packed_pcd, "pcd")),
+)
 def test_a_cloud_keeps_colour_and_may_lack_a_grid(
     write: Callable[..., Path],
     suffix: str,
@@ -215,6 +218,17 @@ def test_a_cloud_keeps_colour_and_may_lack_a_grid(
     np.testing.assert_allclose(points_of(recording, frame)[0], TRUE_M.reshape(-1, 3), atol=1e-6)
     assert frame.rgb is not None
     assert (frame.rgb == (16, 32, 48)).all()
+
+
+def test_a_packed_cloud_has_the_grid_of_a_plain_one(tmp_path: Path) -> None:
+    plain = open_capture([plane.write_pcd(tmp_path / "plain.pcd", TRUE_M)])
+    packed = open_capture([plane.write_packed_pcd(tmp_path / "packed.pcd", TRUE_M)])
+    plain_frame = next(plain.frames())
+    packed_frame = next(packed.frames())
+    assert packed.organised
+    assert packed.lens == plain.lens
+    np.testing.assert_array_equal(packed_frame.z_m, plain_frame.z_m)
+    np.testing.assert_array_equal(packed_frame.rgb, plain_frame.rgb)
 
 
 def test_lists_of_points_without_a_lens_have_no_grid(tmp_path: Path) -> None:

@@ -309,6 +309,19 @@ def test_the_sampling_of_a_grid_is_that_of_its_coarser_axis(tilt: float) -> None
             assert sampling.noise_m == pytest.approx(2e-4, rel=0.06)
 
 
+def test_the_pitch_of_a_grid_of_which_no_neighbours_are_known_is_that_of_its_points() -> None:
+    """Every second pixel of both axes is known: still enough, six pixels apart, for the noise."""
+    lens = Lens(121, 101, 400.0, 400.0, 60.0, 50.0)
+    view = gridded(2e-4, 0.0, lens)
+    is_known = np.zeros((101, 121), bool)
+    is_known[::2, ::2] = True
+    sparse_cloud = replace(view.view.cloud, reason=np.where(is_known, 0, 1).astype(np.uint8))
+    sparse = replace(view, view=replace(view.view, cloud=sparse_cloud), inside=is_known)
+    sampling = registered.sampling_of(sparse)
+    assert sampling.pitch_m == pytest.approx(2 * 0.8 / 400.0, rel=0.02)
+    assert sampling.noise_m == pytest.approx(2e-4, rel=0.06)
+
+
 def test_the_noise_is_no_less_than_rounding_leaves_in_the_mean() -> None:
     lens = Lens(61, 51, 400.0, 400.0, 30.0, 25.0)
     coarse = registered.sampling_of(gridded(0.0, 0.0, lens, step_m=6e-3))
