@@ -24,7 +24,8 @@ from harness.inspection.limit import (
 )
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud
+from tests.support.plain_clouds import cloud_of_points
 
 PITCH_M = 0.002
 SHAPE = (120, 160)
@@ -36,16 +37,8 @@ def plane_cloud(slope: float = 0.0, reach_px: float = 0.0) -> Cloud:
     across = (u - 79.5) * PITCH_M
     down = (v - 59.5) * PITCH_M
     z = 1.0 / (1 - slope * across)
-    return Cloud(
-        points_m=np.stack([across * z, down * z, z], axis=-1),
-        reason=np.zeros(SHAPE, np.uint8),
-        count=np.ones(SHAPE, int),
-        variance_m2=np.full(SHAPE, 1e-6),
-        region=Region(0, SHAPE[0], 0, SHAPE[1]),
-        z_step_m=0.0,
-        n_frames=1,
-        noise_reach_px=reach_px,
-    )
+    points = np.stack([across * z, down * z, z], axis=-1)
+    return cloud_of_points(points, noise_reach_px=reach_px)
 
 
 @dataclass(frozen=True)

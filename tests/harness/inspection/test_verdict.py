@@ -23,6 +23,7 @@ from harness.inspection.verdict import (
 )
 from harness.report.findings import Finding, Judged
 from harness.vocabulary.geometry import Cloud, Region
+from tests.support.plain_clouds import cloud_of_points
 
 NULL = {"threshold": 5.0, "expected": 1.0, "low": 0.0, "high": 4.0}
 PITCH_M = 0.002
@@ -67,16 +68,7 @@ def plane_cloud(slope: float = 0.0, projection: str = "central") -> Cloud:
         points = np.stack([across * z / Z_M, down * z / Z_M, z], axis=-1)
     else:
         points = np.stack([across, down, Z_M + slope * across], axis=-1)
-    return Cloud(
-        points_m=points,
-        reason=np.zeros((40, 60), np.uint8),
-        count=np.ones((40, 60), int),
-        variance_m2=np.full((40, 60), 1e-6),
-        region=Region(0, 40, 0, 60),
-        z_step_m=0.0,
-        n_frames=1,
-        projection=projection,  # type: ignore[arg-type]
-    )
+    return cloud_of_points(points, projection=projection)
 
 
 def evidence_of(cloud: Cloud, **fields: object) -> Evidence:

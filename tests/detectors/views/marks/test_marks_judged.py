@@ -29,6 +29,7 @@ from detectors.views.marks.find import (
 )
 from detectors.views.marks.mark import MarkSet
 from harness.vocabulary.geometry import MM, Cloud, Lens
+from tests.support.plain_clouds import cloud_of_points
 
 LENS = Lens(200, 160, 500.0, 500.0, 99.5, 79.5)
 V, U = np.mgrid[: LENS.height, : LENS.width]
@@ -40,17 +41,8 @@ def pictured(rgb: np.ndarray, tilt: float = 0.0) -> Cloud:
     """A plane z = 0.7 + tilt x without noise."""
     slopes = LENS.region_slopes(LENS.whole)
     z_m = 0.7 / (1.0 - tilt * slopes[..., 0])
-    return Cloud(
-        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.zeros(z_m.shape, np.uint8),
-        count=np.ones(z_m.shape, int),
-        variance_m2=np.full(z_m.shape, np.nan),
-        region=LENS.whole,
-        z_step_m=0.0,
-        n_frames=1,
-        lens=LENS,
-        rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8),
-    )
+    points_m = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    return cloud_of_points(points_m, lens=LENS, rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8))
 
 
 def plain_board() -> np.ndarray:

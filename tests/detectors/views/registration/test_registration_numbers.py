@@ -26,6 +26,7 @@ from detectors.views.registration.pairing import FIT_CHI2, pair_marks
 from detectors.views.registration.settings import CpdRegistration
 from detectors.views.view import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Lens, transform_points
+from tests.support.plain_clouds import cloud_of_points
 
 PITCH_M = 2e-3
 
@@ -279,16 +280,9 @@ def gridded(noise_m: float, tilt: float, lens: Lens, step_m: float = 0.0) -> Pre
     slopes = lens.region_slopes(lens.whole)
     z_m = 0.8 / (1.0 - tilt * slopes[..., 0])
     z_m = z_m + noise_m * np.random.default_rng(8).standard_normal(z_m.shape)
-    cloud = Cloud(
-        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.zeros(z_m.shape, np.uint8),
-        count=np.full(z_m.shape, 9),
-        variance_m2=np.full(z_m.shape, np.nan),
-        region=lens.whole,
-        z_step_m=step_m,
-        n_frames=9,
-        lens=lens,
-    )
+    points_m = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    count = np.full(z_m.shape, 9)
+    cloud = cloud_of_points(points_m, count=count, n_frames=9, z_step_m=step_m, lens=lens)
     return PreparedView(View("v", cloud, None), cloud.valid, MarkSet((), np.zeros(0, int)))
 
 
