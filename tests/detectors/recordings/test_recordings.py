@@ -262,6 +262,28 @@ def test_a_recording_can_be_sent_to_another_process(tmp_path: Path) -> None:
     np.testing.assert_allclose(points_of(recording, next(recording.frames())), TRUE_M, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        # from 0 to 1
+        ([0.0, 0.5, 1.0], [0, 128, 255]),
+        # from 0 to 255, with what lies beyond and what is unknown
+        ([-3.0, 127.6, 300.0], [0, 128, 255]),
+        ([np.nan, 1.0, 255.0], [0, 1, 255]),
+    ],
+)
+def test_colours_that_are_no_whole_numbers_become_bytes(
+    tmp_path: Path, levels: list[float], expected: list[int]
+) -> None:
+    path = tmp_path / "c.npz"
+    rgb = np.broadcast_to(levels, (72, 96, 3)).astype(np.float32)
+    np.savez(path, depth=(STORED / 1e3).astype(np.float32), rgb=rgb)
+    seen = next(open_capture([path], lens=plane.LENS).frames()).rgb
+    assert seen is not None
+    assert seen.dtype == np.uint8
+    assert (seen == expected).all()
+
+
 def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None:
     folder = plane.write_open3d_folder(tmp_path / "plane", 2)
     pictures = sorted((folder / "color").iterdir())
