@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.evaluation.intervals import Interval
+from harness.evaluation.intervals import UNKNOWN, Interval, false_call_rate
 from harness.evaluation.study.curves import ChanceHits, PixelCurves
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import Calibrated
@@ -287,6 +287,39 @@ def test_the_limit_of_a_new_unit_is_quoted(units: SetUpLimit, two: list[SetUpLim
     assert single["one_unit_mm"] == two[0].a90_95.value
     assert "all units (mm)" in limits_grid([units, two[1]]).heads
     assert limits_grid(two).title.startswith("One unit of the camera: ")
+
+
+@pytest.mark.parametrize(
+    ("over_boards", "stated"),
+    [
+        # 3 false calls on 1.5 m²: Garwood's interval is 0.41 to 5.8
+        (UNKNOWN, "(0.41 to 5.8)"),
+        (Interval(1.0, 3.0), "(0.41 to 5.8)"),
+        (Interval(0.1, 9.0), "(0.1 to 9)"),
+    ],
+)
+def test_false_calls_of_several_units_have_the_wider_interval(
+    units: SetUpLimit, over_boards: Interval, stated: str
+) -> None:
+    limit = replace(
+        units, false_calls=false_call_rate(3, 1.5), false_calls_interval_per_m2=over_boards
+    )
+    assert limit_sentence(limit).endswith(f", at 2 false calls per m² {stated}.")
+
+
+def test_the_limit_over_boards_is_recommended_for_a_single_unit_alone(
+    units: SetUpLimit, two: list[SetUpLimit]
+) -> None:
+    """The limit of a new unit contains what boards do."""
+    wider = replace(two[0].a90_95, value=1.2 * two[0].a90_95.value)
+    of_one = replace(two[0], over_boards=wider, design_effect=2.34)
+    of_several = replace(units, over_boards=wider, design_effect=2.34)
+    note = (
+        "the results of damages on one board are correlated (design effect 2.3): "
+        "quote the limit over boards"
+    )
+    assert note in notes_of(of_one)
+    assert note not in notes_of(of_several)
 
 
 def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLimit]) -> None:

@@ -60,6 +60,18 @@ def gauge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.parametrize(("largest_mm", "is_told"), [(10, True), (11, False)])
+def test_sizes_that_would_not_show_a_larger_a90_are_told(
+    largest_mm: int, is_told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A guess of 7 mm may be too small by a factor of 1.5."""
+    sizes = ["--diameters", f"2:{largest_mm}", "--a50", "5", "--a90", "7", "--targets", "10"]
+    assert gauge.main([*sizes, "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert ("warning: " in printed) == is_told
+    assert ("the true a90 is 10.5 mm, which no hole of 2 to 10 mm would show" in printed) == is_told
+
+
 def test_the_truth_holds_what_was_designed(gauge_folder: Path):
     (board,) = read_gauge(gauge_folder / "gauge.json").boards
     sizes = np.array([hole.diameter_mm for hole in board.holes])

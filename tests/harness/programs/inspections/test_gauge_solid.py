@@ -69,9 +69,12 @@ def test_the_3mf_has_the_body_and_its_black_marks(solid: trimesh.Trimesh):
 
 def test_the_files_of_a_gauge(tmp_path: Path, capsys):
     assert gauge.main(["--cut", "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert "recessed by 0.6 mm" in said
-    assert "gauge.3mf" not in said
+    printed = capsys.readouterr().out
+    assert "recessed by 0.6 mm" in printed
+    assert "gauge.3mf" not in printed
+    body = trimesh.load(tmp_path / "gauge.stl")
+    width_mm, height_mm, tallest_mm = np.ptp(body.bounds, axis=0)
+    assert f"gauge: {width_mm:g} x {height_mm:g} mm, {tallest_mm:.1f} mm tall: " in printed
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["calliper.csv", "gauge.json", "gauge.stl", "gauge.svg"]
     truth = read_solid_gauge(tmp_path / "gauge.json")
