@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from detectors.crop import Choice
 from detectors.recordings import open_capture
 from harness.inspection.output import (
     _rings,
     capture_facts,
+    choice_facts,
     mm,
     number,
     scene_of,
@@ -55,6 +59,25 @@ def test_the_facts_of_a_capture_are_in_millimetres(tmp_path: Path) -> None:
     assert facts["depth_unit"]["mm"] == pytest.approx(1000.0)
     unknown = replace(cloud, noise_reach_px=0.0)
     assert capture_facts(recording, unknown)["noise_reach_px"] is None
+
+
+def test_the_facts_of_a_choice_are_in_millimetres_and_shares() -> None:
+    mask = np.zeros((4, 5), bool)
+    mask[1:3, 1:4] = True
+    candidate = SimpleNamespace(
+        depths_m=(0.39, 0.4, 0.45), extent_m=(0.15, 0.11), share=0.3, tilt_deg=4.0, mask=mask
+    )
+    choice = cast(Choice, SimpleNamespace(taken=1, warnings=(), candidates=(candidate,)))
+    facts = choice_facts(choice)
+    assert facts is not None
+    (stated,) = facts["candidates"]
+    depths_mm = (stated["nearest_mm"], stated["distance_mm"], stated["farthest_mm"])
+    assert depths_mm == pytest.approx((390.0, 400.0, 450.0))
+    assert stated["extent_mm"] == pytest.approx([150.0, 110.0])
+    assert stated["share_of_view"] == 0.3
+    assert stated["tilt_deg"] == 4.0
+    assert stated["pixels"] == 6
+    assert choice_facts(None) is None
 
 
 def test_a_scene_is_in_millimetres_with_a_ring_around_each_finding() -> None:

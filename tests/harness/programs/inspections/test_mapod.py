@@ -13,10 +13,12 @@ import pytest
 from scipy import special
 
 from harness.evaluation.pod.curve import PodCurve, link_ppf
+from harness.evaluation.pod.inspections import Inspections
+from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.programs.inspections import pod
 from harness.programs.inspections.design_statistics import curve_through, even_sizes
-from harness.programs.inspections.mapod import LIMIT_AT, Transfer, quantile
+from harness.programs.inspections.mapod import LIMIT_AT, Mapod, Transfer, quantile
 from tests.support.synthetic_study import SetUp, Study, study_record
 from tests.validation.mapod_coverage import coverage, wrong_by
 
@@ -175,8 +177,32 @@ def test_agreement_counts_simulated_campaigns_that_are_as_far() -> None:
     be: 1 of 1000. Hits as expected are no evidence."""
     curve = uncertain(False)
     size = np.array([1.0, 2.0, 3.0, 8.0, 9.0, 10.0])
-    assert campaign(size, size < 5.0, curve).agreement() < 0.01
+    assert campaign(size, size < 5.0, curve).agreement() == 1 / 1000
     assert campaign(size, size > 5.0, curve).agreement() > 0.2
+
+
+def test_the_combined_limit_is_the_largest_over_all_simulated_models() -> None:
+    record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
+    statement = limit_of(record.set_ups[0], draws=10).statement
+    assert statement is not None
+    size = even_sizes(24, (2.0, 12.0))
+    hit = np.random.default_rng(2).random(24) < curve_through(6.0, 7.6).pod(size)
+    read = Inspections(
+        path=Path("real.csv"),
+        size_column="size",
+        response_column="found",
+        size=size,
+        response=hit.astype(float),
+        target=None,
+        line=np.arange(1, 25),
+    )
+    # the likeliest model has the largest limit here: it is put last
+    reversed_fits = replace(statement, fits=statement.fits[::-1])
+    combined = Mapod.of("50 frames", reversed_fits, "", read)
+    limits = [transfer.steps()[-1].a90_95 for transfer in combined.transfers]
+    assert max(limits) > limits[0]
+    assert combined.steps[-1].a90_95 == max(limits)
+    assert combined.steps[-1].a90 == combined.transfers[0].steps()[-1].a90
 
 
 @pytest.mark.slow  # a Monte Carlo campaign
