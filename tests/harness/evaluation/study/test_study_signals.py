@@ -118,6 +118,15 @@ def test_boards_that_differ_widen_the_interval_as_a_jackknife_does():
     assert of_boards > 1.3 * of_damages[0, 0]
 
 
+def test_boards_that_cancel_leave_the_variance_of_damages():
+    """Boards' influences may be small by chance; damages are no more certain for it."""
+    record = studied(2)
+    (line, *_) = sizes(record).lines
+    cancelled = dataclasses.replace(line, influence=1e-3 * line.influence)
+    expected = line.fit.curve.covariance[0, 0] + line.of_threshold**2
+    assert cancelled.variance(0.5) == pytest.approx(expected)
+
+
 def test_the_thresholds_error_is_error_over_slope():
     record = studied(3)
     exact = dataclasses.replace(record, threshold_error=None)
