@@ -120,8 +120,9 @@ def test_thresholds_set_by_one_place_or_too_high_are_warned_of(two: list[SetUpLi
     half_px = {"u_px": np.array([10.0, 10.0, 90.0, 50.0]), "v_px": np.zeros(4)}
     most_px = {"u_px": np.array([10.0, 10.0, 12.0, 50.0]), "v_px": np.zeros(4)}
     all_px = {"u_px": np.full(4, 10.0), "v_px": np.zeros(4)}
+    # the first run sets a threshold of 4.1
     for columns in (far_px, half_px):
-        assert threshold_warnings([with_runs(two[0], 7.5, **columns)]) == []
+        assert threshold_warnings([with_runs(two[0], 4.1, **columns)]) == []
     (crowd,) = threshold_warnings([with_runs(two[0], 4.4, **all_px), with_runs(two[1], 7.5)])
     assert crowd.startswith("1 frame: 4 of 4 calibration boards have their highest score on the")
     several = [with_runs(two[0], 4.1, **all_px), with_runs(two[1], 4.1, **most_px)]
