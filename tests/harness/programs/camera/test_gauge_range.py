@@ -55,17 +55,17 @@ def test_blur_is_found_without_bias_and_held_by_its_intervals(blur_px: float):
     assert exact is not None
     assert variance_of(exact.blur_px) == pytest.approx(variance_of(blur_px), abs=3e-3)
     found = []
-    held = 0
+    covered = 0
     for seed in range(DRAWS):
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(inverse.shape)
         noisy = replace(sharp, range_m=1 / inverse + noise_m)
         blur = edge_blur(noisy, sharp.range_m, displaced_px=0.0)
         assert blur is not None
         found.append(variance_of(blur.blur_px))
-        held += blur.interval.low <= blur_px <= blur.interval.high
+        covered += blur.interval.low <= blur_px <= blur.interval.high
         wide = variance_of(blur.interval.high) - variance_of(blur.blur_px)
         assert wide < 0.1 + 0.1 * blur_px
-    assert held >= DRAWS - 2
+    assert covered >= DRAWS - 2
     if blur_px >= 0.6:
         assert np.mean(found) == pytest.approx(variance_of(blur_px), abs=0.01)
 
