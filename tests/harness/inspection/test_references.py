@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,16 @@ import trimesh
 
 from harness import detect
 from harness.inspection.arguments import is_mesh
-from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change, _departure_m
+from harness.inspection.changes import (
+    GONE,
+    GROWN,
+    NEW,
+    SHRUNK,
+    DamageSize,
+    _change,
+    _departure_m,
+    _rest,
+)
 from harness.inspection.references import captures_in
 from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support import marked_board
@@ -178,6 +188,21 @@ def test_states(
     if change_mm == 1.5 and now_mm == 2.5:
         assert change.then is not None
         assert change.then.depth_mm == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("depth_mm", "is_left"), [(1.29, True), (1.27, False), (-1.29, True)])
+def test_what_is_left_of_a_damage_exceeds_two_standard_errors(
+    depth_mm: float, is_left: bool
+) -> None:
+    """Depth and change have errors of 0.1 mm each: 0.28 mm is twice that of their difference."""
+    size = DamageSize(10.0, depth_mm, 0.1)
+    change = DamageSize(10.0, math.copysign(1.0, depth_mm), 0.1)
+    rest = _rest(size, change, -1.0)
+    assert (rest is not None) == is_left
+    if rest is not None:
+        assert rest.depth_mm == pytest.approx(math.copysign(0.29, depth_mm))
+        assert rest.depth_se_mm == pytest.approx(0.1 * math.sqrt(2.0))
+        assert math.isnan(rest.diameter_mm)
 
 
 def test_a_departure_is_that_of_the_core_from_the_ring_around_it() -> None:
