@@ -16,6 +16,7 @@ from harness.inspection.limit import (
     Disc,
     SizeCount,
     fitted,
+    found_at,
     free_area,
     limit_of,
     next_step,
@@ -148,6 +149,30 @@ def test_the_limit_is_the_detectors_own() -> None:
     assert widths == sorted(widths) and {size.depth_mm for size in limit.sizes} == {4.0}
     assert limit.text.startswith("damage 4 mm deep is found in 90 % of places from ")
     assert limit.facts["sizes"][0]["hits"] == 0
+
+
+def test_discs_that_uncertain_steps_explain_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in an inspection, where such findings are left out."""
+    detector = WidthDetector()
+    result = judged_of(detector, plane_cloud())
+    size = {"diameter_m": 0.02, "depth_m": 0.004}
+    count = found_at(detector, result, 1.0, **size)
+    assert count is not None
+    assert count.hits == count.places > 10
+
+    def all_but_the_first(
+        cloud: Cloud, evidence: Evidence, detections: tuple[Detection, ...], threshold: float
+    ) -> tuple[int, ...]:
+        assert evidence.score.shape == cloud.valid.shape
+        assert threshold == 1.0
+        return tuple(range(1, len(detections)))
+
+    monkeypatch.setattr("harness.inspection.limit.at_steps", all_but_the_first)
+    explained = found_at(detector, result, 1.0, **size)
+    assert explained is not None
+    # one in each of the clouds that together have as many places
+    assert 0 < explained.hits < count.hits / 2
+    assert explained.places == count.places
 
 
 def test_without_a_depth_discs_are_half_as_deep_as_wide() -> None:

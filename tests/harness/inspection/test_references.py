@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from detectors.interface import Evidence
+from detectors.surfaces.scans import laid_under, scan_of
 from harness import detect
 from harness.inspection.arguments import is_mesh
 from harness.inspection.changes import (
@@ -24,11 +26,13 @@ from harness.inspection.changes import (
     _change,
     _departure_m,
     _rest,
+    changes_of,
 )
 from harness.inspection.references import captures_in
+from harness.report.findings import Judged
 from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support import marked_board
-from tests.support.made_parts import Dent, MadePart, pose, write_capture
+from tests.support.made_parts import Dent, MadePart, cloud_of, pose, write_capture
 
 THEN = MadePart((Dent(0, 0, 14, 1.0), Dent(20, -30, 12, 2.5), Dent(-15, -30, 12, 1.5)))
 NOW = MadePart((Dent(0, 0, 18, 2.5), Dent(20, -30, 12, 2.5), Dent(40, 10, 12, 1.5)))
@@ -203,6 +207,25 @@ def test_what_is_left_of_a_damage_exceeds_two_standard_errors(
         assert rest.depth_mm == pytest.approx(math.copysign(0.29, depth_mm))
         assert rest.depth_se_mm == pytest.approx(0.1 * math.sqrt(2.0))
         assert math.isnan(rest.diameter_mm)
+
+
+def test_pixels_that_share_their_noise_count_once_in_a_change() -> None:
+    """Cylinders hold 20 points of the earlier capture. If nine pixels of the later one share their
+    noise, the variance of its mean is nine times as large, that of the difference five times."""
+    earlier, earlier_mask = cloud_of(MadePart(), pose(), seed=1)
+    scan = scan_of(earlier, earlier_mask, "earlier")
+    seen, mask = cloud_of(MadePart(), pose((4.0, -3.0, 5.0)), seed=2)
+    seen = replace(seen, expected=laid_under(scan, seen, mask))
+    residual_m = np.where(mask, 0.0, np.nan)
+    noise_m = []
+    for reach_px in (1.0, 3.0):
+        cloud = replace(seen, noise_reach_px=reach_px)
+        evidence = Evidence(residual_m, residual_m, cloud.points_m[..., 2], 1e-3)
+        capture = Judged(cloud, evidence, (), ())
+        changes = changes_of(capture, scan, capture, capture)
+        assert changes.radius_m == pytest.approx(math.sqrt(20 / math.pi) * scan.pitch_m)
+        noise_m.append(np.nanmedian(changes.distances.noise_m))
+    assert noise_m[1] / noise_m[0] == pytest.approx(math.sqrt(5.0), rel=0.06)
 
 
 def test_a_departure_is_that_of_the_core_from_the_ring_around_it() -> None:
