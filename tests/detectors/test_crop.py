@@ -24,6 +24,7 @@ from detectors.pixels.masks import holes_filled
 from detectors.surfaces.smooth_surfaces import smooth_surfaces
 from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import Cloud, Lens, Region
+from tests.support.plain_clouds import cloud_of_points
 from tests.support.target_scenes import SCENES, Scene
 
 LENS = Lens(200, 150, 250.0, 250.0, 99.5, 74.5)
@@ -529,17 +530,8 @@ def flat_candidate(mask: np.ndarray, slope: float = 0.0, organised: bool = True)
     lens = Lens(width, height, 200.0, 200.0, (width - 1) / 2, (height - 1) / 2)
     slopes = lens.region_slopes(lens.whole)
     z_m = 0.8 / (1.0 - slope * slopes[..., 0])
-    cloud = Cloud(
-        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.zeros(mask.shape, np.uint8),
-        count=np.ones(mask.shape, int),
-        variance_m2=np.full(mask.shape, np.nan),
-        region=Region(0, height, 0, width),
-        z_step_m=0.0,
-        n_frames=1,
-        organised=organised,
-        lens=lens,
-    )
+    points_m = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    cloud = cloud_of_points(points_m, organised=organised, lens=lens)
     return Candidate(mask=mask, filled=holes_filled(mask), outline=mask, grid=cloud)
 
 

@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from harness.vocabulary.geometry import MM, Cloud, Lens, rays_of, transform_points
+from tests.support.plain_clouds import cloud_of_points
 
 LENS = Lens(width=150, height=120, fx=260.0, fy=260.0, cx=74.5, cy=59.5)
 HALF_M = (0.075, 0.055)
@@ -104,16 +105,7 @@ def cloud_of(
     noise_m = noise_mm * MM * np.random.default_rng(seed).standard_normal(true_m.shape)
     slopes = LENS.region_slopes(LENS.whole)
     directions = rays_of(slopes)
-    cloud = Cloud(
-        points_m=directions * (true_m + noise_m)[..., None],
-        reason=np.zeros(true_m.shape, np.uint8),
-        count=np.ones(true_m.shape, int),
-        variance_m2=np.full(true_m.shape, np.nan),
-        region=LENS.whole,
-        z_step_m=0.0,
-        n_frames=1,
-        lens=LENS,
-    )
+    cloud = cloud_of_points(directions * (true_m + noise_m)[..., None], lens=LENS)
     return cloud, ndimage.binary_erosion(true_m < WALL_M, iterations=3)
 
 

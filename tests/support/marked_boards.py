@@ -18,6 +18,7 @@ from harness.vocabulary.geometry import (
     rotation_xyz_deg,
     transform_points,
 )
+from tests.support.plain_clouds import cloud_of_points
 
 LENS = Lens(width=400, height=140, fx=500.0, fy=500.0, cx=199.5, cy=69.5)
 TAPES = np.array([[-0.2, 0.038], [0.2, 0.038], [0.2, -0.038], [-0.2, -0.038]])
@@ -96,17 +97,8 @@ def marked_cloud(
         # the mean of 5 x 5 independent values has a fifth of their deviation
         z = z + cv2.blur(rng.standard_normal(z.shape), (5, 5)) * 5.0 * sigma_m
     points = rays_of(slopes) * z[..., None]
-    return Cloud(
-        points_m=points,
-        reason=np.zeros(z.shape, np.uint8),
-        count=np.ones(z.shape, np.int64),
-        variance_m2=np.full(z.shape, np.nan),
-        region=Region(0, lens.height, 0, lens.width),
-        z_step_m=0.0,
-        n_frames=1,
-        lens=lens,
-        rgb=np.clip(np.rint(colours), 0, 255).astype(np.uint8),
-    )
+    rgb = np.clip(np.rint(colours), 0, 255).astype(np.uint8)
+    return cloud_of_points(points, lens=lens, rgb=rgb)
 
 
 def prepared(name: str, marks: MarkSet, T_reference_view_guess: np.ndarray | None) -> PreparedView:

@@ -4,6 +4,7 @@ known."""
 from __future__ import annotations
 
 import json
+import struct
 import zipfile
 from fractions import Fraction
 from pathlib import Path
@@ -73,20 +74,41 @@ def write_lens(path: Path) -> Path:
     return path
 
 
-def write_pcd(path: Path, points: np.ndarray, organised: bool = True, cut: int = 0) -> Path:
-    """A binary PCD with colour; ``cut`` bytes are missing at the end."""
+def _pcd_header(points: np.ndarray, organised: bool, kind: str) -> bytes:
     height, width = points.shape[:2] if organised else (1, points[..., 0].size)
     header = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
         f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
-        f"POINTS {width * height}\nDATA binary\n"
+        f"POINTS {width * height}\nDATA {kind}\n"
     )
-    rows = np.zeros(width * height, dtype=[("xyz", "<f4", 3), ("rgb", "<u4")])
+    return header.encode()
+
+
+def write_pcd(path: Path, points: np.ndarray, organised: bool = True, cut: int = 0) -> Path:
+    """A binary PCD with colour; ``cut`` bytes are missing at the end."""
+    rows = np.zeros(points[..., 0].size, dtype=[("xyz", "<f4", 3), ("rgb", "<u4")])
     rows["xyz"] = points.reshape(-1, 3)
     rows["rgb"] = 0x102030
-    content = header.encode() + rows.tobytes()
+    content = _pcd_header(points, organised, "binary") + rows.tobytes()
     path.write_bytes(content[: len(content) - cut])
     return path
+
+
+def write_packed_pcd(path: Path, points: np.ndarray, organised: bool = True) -> Path:
+    """A PCD in the form of compressed ones, with all x first, then all y, z and colours."""
+    fields = points.reshape(-1, 3).T.astype("<f4").tobytes()
+    colours = np.full(points[..., 0].size, 0x102030, "<u4").tobytes()
+    plain = fields + colours
+    packed = lzf_literals(plain)
+    sizes = struct.pack("<II", len(packed), len(plain))
+    path.write_bytes(_pcd_header(points, organised, "binary_compressed") + sizes + packed)
+    return path
+
+
+def lzf_literals(plain: bytes) -> bytes:
+    """Bytes in LZF as they are: in runs of at most 32, each behind its length less one."""
+    runs = [plain[start : start + 32] for start in range(0, len(plain), 32)]
+    return b"".join(bytes([len(run) - 1]) + run for run in runs)
 
 
 def write_ply(path: Path, points: np.ndarray, grid: bool = True, cut: int = 0) -> Path:

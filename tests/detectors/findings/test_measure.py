@@ -11,12 +11,21 @@ import pytest
 from pydantic import ValidationError
 
 from detectors.findings.extents import extents
-from detectors.findings.family import BLURS
+from detectors.findings.family import BLURS, DEPTH_ERROR
 from detectors.findings.hole_patch import HolePatch
-from detectors.findings.measure import _modelled, measure_detection
+from detectors.findings.measure import (
+    AMBIGUOUS,
+    CONTOUR_ZOOM,
+    MISFIT,
+    _by_contour,
+    _contour_depth,
+    _modelled,
+    measure_detection,
+)
 from detectors.findings.pictures import pictures
 from detectors.findings.surroundings import (
     HoleModelConfig,
+    Surroundings,
     _blurs_of,
     _tilt_m,
     blur_in_cells,
@@ -464,6 +473,109 @@ def test_a_deep_hole_falls_back_to_its_contour() -> None:
     assert m.model_depth_m == pytest.approx(0.2, abs=1e-3)
 
 
+CONE_PX = 12.0
+"""Radius of a cone's rim; half-way down, it is half as wide."""
+
+
+def cone(depth_m: float, blur_px: float) -> Surroundings:
+    """A cone in the surroundings of a drilled hole, exact and without an offset."""
+    cloud, evidence = Board(25.0, 12.7).seen(0.1, 1)
+    around = surroundings_of(cloud, evidence, strongest(cloud, evidence, 5.0), PLAIN)
+    assert around is not None
+    height, width = around.detected.shape
+    rows, columns = np.indices((height, width))
+    from_middle_px = np.hypot(rows - (height - 1) / 2, columns - (width - 1) / 2)
+    residual_m = depth_m * np.clip(1.0 - from_middle_px / CONE_PX, 0.0, 1.0)
+    everywhere = np.ones((height, width), bool)
+    patch = replace(
+        around.patch, residual_m=residual_m, used=everywhere, blur_px=(blur_px, blur_px)
+    )
+    return replace(
+        around,
+        patch=patch,
+        detected=from_middle_px < CONE_PX,
+        invalid=~everywhere,
+        offset_m=0.0,
+        sign=1.0,
+        peak_m=depth_m,
+    )
+
+
+def contoured(around: Surroundings, doubt: str, volume_m3: float = 0.0) -> Measurement:
+    bare = Measurement(0.0, 0.0, 9, 9.0, 0.03, np.zeros(3), volume_m3=volume_m3)
+    return _by_contour(bare, around, doubt)
+
+
+def test_the_error_of_a_contours_diameter_is_half_of_its_flanks_and_what_blur_moves() -> None:
+    """A cone's contours at 0.35 and 0.65 of its depth are 1.3 and 0.7 radii wide; a blur of b
+    pixels moves one of diameter d by b^2 / (6 d)."""
+    around = cone(10e-3, blur_px=5.0)
+    pixel_m = math.sqrt(around.area_m2)
+    contour = contoured(around, "the residual is no hole")
+    assert contour.model_diameter_m == pytest.approx(CONE_PX * pixel_m, rel=0.01)
+    flank_m = 0.3 * CONE_PX * pixel_m
+    moved_m = 25.0 / (6.0 * CONE_PX) * pixel_m
+    expected_m = math.hypot(flank_m, moved_m)
+    assert contour.model_diameter_se_m == pytest.approx(expected_m, rel=0.01)
+
+    # a wide blur moves it by half of its diameter at most
+    blurred = contoured(cone(10e-3, blur_px=25.0), "the residual is no hole")
+    half_m = 0.5 * blurred.model_diameter_m
+    assert blurred.model_diameter_se_m == pytest.approx(math.hypot(flank_m, half_m), rel=0.01)
+
+    unclear = contoured(around, AMBIGUOUS)
+    assert unclear.model_diameter_se_m == pytest.approx(math.hypot(flank_m, half_m), rel=0.01)
+
+
+def test_the_depth_of_a_contour_has_the_models_error_too() -> None:
+    """A cone of 10 mm, whose contour holds the pixels that are deeper than 5 mm."""
+    around = cone(10e-3, blur_px=5.0)
+    contour = contoured(around, "the residual is no hole")
+    assert contour.model_depth_m == pytest.approx(10e-3)
+    residual_m = around.patch.residual_m
+    median_m = float(np.median(residual_m[residual_m > 5e-3]))
+    own_m = math.hypot(0.5 * (10e-3 - median_m), around.patch.noise_m)
+    expected_m = math.hypot(own_m, DEPTH_ERROR * 10e-3)
+    assert contour.model_depth_se_m == pytest.approx(expected_m, rel=0.03)
+
+
+def test_the_depth_of_ragged_damage_is_its_volume_over_its_area() -> None:
+    """The area's relative error is twice that of the diameter."""
+    around = cone(10e-3, blur_px=5.0)
+    area_m2 = math.pi / 4 * (CONE_PX**2) * around.area_m2
+    ragged = contoured(around, MISFIT, volume_m3=4e-3 * area_m2 * around.normal_share)
+    assert ragged.shape == "ragged"
+    assert ragged.model_depth_m == pytest.approx(4e-3, rel=0.02)
+    relative = ragged.model_diameter_se_m / ragged.model_diameter_m
+    expected = math.hypot(2.0 * relative, DEPTH_ERROR)
+    assert ragged.model_depth_se_m / ragged.model_depth_m == pytest.approx(expected)
+
+
+def test_the_error_of_a_contours_depth_is_half_of_what_the_median_lacks_and_the_noise() -> None:
+    """Three pixels lie 3, 5 and 11 mm beyond the offset; the peak of 11 mm exceeds their median by
+    6 mm."""
+    cloud, evidence = Board(12.7, 12.7).seen(0.1, 1)
+    around = surroundings_of(cloud, evidence, strongest(cloud, evidence, 5.0), HoleModelConfig())
+    assert around is not None
+    residual_m = np.full(around.detected.shape, 0.9)
+    residual_m[4, 4:7] = [4e-3, 6e-3, 12e-3]
+    pixels = np.zeros(residual_m.shape, bool)
+    pixels[4, 4:7] = True
+    inside = np.kron(pixels, np.ones((CONTOUR_ZOOM, CONTOUR_ZOOM))) > 0
+    patch = replace(around.patch, residual_m=residual_m, noise_m=0.4e-3)
+    behind = replace(around, patch=patch, offset_m=1e-3, peak_m=11e-3, sign=1.0)
+    depth_m, error_m = _contour_depth(behind, inside, residual_m)
+    assert depth_m == 11e-3
+    assert error_m == pytest.approx(math.hypot(3e-3, 0.4e-3))
+
+    mirrored = replace(patch, residual_m=-residual_m)
+    in_front = replace(behind, patch=mirrored, offset_m=-1e-3, sign=-1.0)
+    assert _contour_depth(in_front, inside, residual_m) == (-depth_m, error_m)
+
+    nothing_inside = np.zeros_like(inside)
+    assert math.isnan(_contour_depth(behind, nothing_inside, residual_m)[1])
+
+
 def test_the_mouth_of_an_oblique_deep_hole_is_measured_and_not_what_it_shows_through() -> None:
     # 26 degrees off the axis and 20 off the normal, the tube of 20 mm hides most of what lies 0.5
     # m behind
@@ -621,7 +733,8 @@ def test_an_isolated_pixel_is_measured_without_a_crash() -> None:
     )
     assert m.points == 1
     assert m.extent_diameter_m == 0.0
-    assert m.model_note != "" or m.model_diameter_se_m > 0.15 * m.model_diameter_m
+    assert m.model_note.startswith("the blur hides the difference between diameter and depth")
+    assert m.model_diameter_se_m > 0.5 * m.model_diameter_m
 
 
 def test_an_even_blur_is_refused() -> None:

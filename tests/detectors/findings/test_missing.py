@@ -183,6 +183,20 @@ def test_a_pixel_that_seldom_returns_counts_as_missing() -> None:
         assert missing.blind == 0.0
 
 
+def test_what_is_seldom_seen_is_so_of_all_frames_though_no_pixel_returns_in_each() -> None:
+    """Eight of 20 frames show the board; a hole in three of them is missing, and one in four of
+    20 just so, as it lacks a return in 80 %."""
+    cloud, evidence = looked(np.zeros(SHAPE, bool))
+    hole = disc(60, 45, 10)
+    for returned, expected in ((3, 1), (4, 1), (5, 0)):
+        count = np.where(hole, returned, 8)
+        missing = missing_returns(replace(cloud, count=count, n_frames=20), evidence)
+        assert missing is not None
+        assert len(missing.detections) == expected
+        assert missing.unseen[0, 0] == pytest.approx(0.6)
+        assert missing.unseen[45, 60] == pytest.approx(1.0 - returned / 20)
+
+
 def test_a_cloud_without_a_grid_does_not_tell_what_it_lacks() -> None:
     cloud, evidence = looked(np.zeros(SHAPE, bool))
     assert missing_returns(replace(cloud, organised=False), evidence) is None

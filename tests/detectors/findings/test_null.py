@@ -209,6 +209,16 @@ def test_a_tail_that_too_many_peaks_exceed_is_that_of_the_higher_half() -> None:
     assert poisson.sf((peaks > together).sum() - 1, 0.5) < 0.1
 
 
+def test_a_tail_holds_for_the_whole_area_of_which_its_peaks_are_a_part() -> None:
+    """The same peaks, of a sixth of the area in which six times as many calls are expected."""
+    random = np.random.default_rng(6)
+    peaks = np.append(3.0 + random.exponential(0.15, 200), 8.0 + random.exponential(0.5, 20))
+    alone = _fitting_tail(peaks, 3.0, 0.5)
+    of_a_sixth = _fitting_tail(peaks, 3.0, 3.0, area_ratio=6.0)
+    assert (of_a_sixth.peaks, of_a_sixth.floor) == (alone.peaks, alone.floor)
+    assert of_a_sixth.threshold(3.0) == pytest.approx(alone.threshold(0.5))
+
+
 def test_skewness_is_that_of_the_quartiles() -> None:
     cloud = plane(np.zeros((4, 5)))
     evidence = analysed(cloud)

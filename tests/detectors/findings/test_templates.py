@@ -180,6 +180,13 @@ def test_the_rectangle_spreads_as_widely_as_the_energy() -> None:
     assert checked > 30
 
 
+def test_the_legal_half_sides_are_near_those_of_all_templates() -> None:
+    """Within half a pixel of small ones, and within a quarter of large ones."""
+    half_sides_px = np.arange(0.0, 18.01, 0.25)
+    distances_px = np.abs(half_sides_px[:, None] - np.array(SIDES_PX)).min(axis=1)
+    assert (distances_px <= np.maximum(0.5, half_sides_px / 4)).all()
+
+
 def test_templates_with_fewer_independent_maxima_are_raised() -> None:
     """The density of maxima is the root of the product of the second moments of the whitened
     spectrum along both axes; the logarithm of its ratio raises the square of a score."""

@@ -8,7 +8,8 @@ import pytest
 
 from detectors import load_detector
 from detectors.surfaces.surface import along_rays
-from harness.vocabulary.geometry import Cloud, Lens, Region, rays_of
+from harness.vocabulary.geometry import Cloud, Lens, rays_of
+from tests.support.plain_clouds import cloud_of_points
 
 SHAPE = (90, 120)
 LENS = Lens(SHAPE[1], SHAPE[0], 500.0, 500.0, -120.0, 44.5)
@@ -32,13 +33,10 @@ def dented_board() -> Cloud:
     is_dent = np.linalg.norm(face - middle, axis=-1) < RADIUS_M
     z = (DISTANCE_M + DEPTH_M * is_dent) / opening
     z = z + NOISE_M * np.random.default_rng(1).standard_normal(SHAPE)
-    return Cloud(
-        points_m=rays * z[..., None],
-        reason=np.zeros(SHAPE, np.uint8),
+    return cloud_of_points(
+        rays * z[..., None],
         count=np.full(SHAPE, 20),
         variance_m2=np.full(SHAPE, 20 * NOISE_M**2),
-        region=Region(0, SHAPE[0], 0, SHAPE[1]),
-        z_step_m=0.0,
         n_frames=20,
         lens=LENS,
     )

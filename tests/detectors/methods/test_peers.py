@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.spatial.distance import cdist
 
 from detectors import load_detector
@@ -231,6 +232,12 @@ def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch
 
 
 # ---------------------------------------------------------------- fpfh_memory
+
+
+def test_features_are_averaged_over_one_pixel_at_least() -> None:
+    assert FpfhMemoryConfig.from_data({**WHOLE, "pool_px": 1}).pool_px == 1
+    with pytest.raises(ValidationError, match="pool_px"):
+        FpfhMemoryConfig.from_data({**WHOLE, "pool_px": 0})
 
 
 def test_without_a_memory_nothing_is_judged() -> None:

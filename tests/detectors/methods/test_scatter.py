@@ -122,6 +122,20 @@ def test_scores_where_the_noise_is_higher_are_divided() -> None:
     assert right_share < 1.0
 
 
+@pytest.mark.parametrize(("quiet", "deviation"), [(FEWEST, 7.0), (FEWEST + 1, 1.0)])
+def test_too_few_quiet_scores_leave_the_scatter_to_the_loud_ones(
+    quiet: int, deviation: float
+) -> None:
+    """Loud scores scatter seven times as much, all of them far from the outline."""
+    scores = (7.0 * np.random.default_rng(8).standard_normal(SHAPE)).astype(np.float32)
+    loud = np.ones(SHAPE, bool)
+    loud.ravel()[:quiet] = False
+    scores.ravel()[:quiet] = np.random.default_rng(9).standard_normal(quiet)
+    far_px = np.full(SHAPE, 100.0, np.float32)
+    one_zone = zones_of(np.ones(SHAPE, np.float32), far_px, loud)
+    assert evened(scores, NARROW, one_zone) == pytest.approx(deviation, rel=0.1)
+
+
 @pytest.mark.parametrize("slot", [False, True])
 def test_strong_scores_of_wide_templates_do_not_count(slot: bool) -> None:
     sides = SlotSides(24.0, 2.0, 0.0) if slot else None

@@ -144,18 +144,15 @@ def test_a_detections_score_is_the_threshold_at_which_it_vanishes() -> None:
     detector = load_detector("thesis", {"min_points": 3})
     cloud = board(HOLES)
     evidence = detector.analyse(cloud)
-    for detections in detector.find(cloud, evidence, 6.0):
-        kept = [
-            set(d.pixels)
-            for d in detector.find(
-                cloud,
-                evidence,
-                np.nextafter(detections.score, 0.0),
-            )
-        ]
-        gone = [set(d.pixels) for d in detector.find(cloud, evidence, detections.score)]
-        assert any(pixels & set(detections.pixels) for pixels in kept)
-        assert not any(pixels & set(detections.pixels) for pixels in gone)
+    detections = detector.find(cloud, evidence, 6.0)
+    assert len(detections) == len(HOLES)
+    for detection in detections:
+        pixels = set(detection.pixels)
+        just_below = np.nextafter(detection.score, 0.0)
+        kept = detector.find(cloud, evidence, just_below)
+        above = detector.find(cloud, evidence, detection.score)
+        assert any(pixels & set(other.pixels) for other in kept)
+        assert not any(pixels & set(other.pixels) for other in above)
 
 
 def test_nothing_can_be_found_among_too_few_points() -> None:

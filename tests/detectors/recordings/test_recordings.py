@@ -202,7 +202,10 @@ def test_colour_lies_on_the_depth_pixels(
     np.testing.assert_array_equal(next(opened(tmp_path).frames()).rgb, plane.rgb())
 
 
-@pytest.mark.parametrize(("write", "suffix"), ((plane.write_ply, "ply"), (plane.write_pcd, "pcd")))
+@pytest.mark.parametrize(
+    ("write", "suffix"),
+    ((plane.write_ply, "ply"), (plane.write_pcd, "pcd"), (plane.write_packed_pcd, "pcd")),
+)
 def test_a_cloud_keeps_colour_and_may_lack_a_grid(
     write: Callable[..., Path],
     suffix: str,
@@ -216,6 +219,17 @@ def test_a_cloud_keeps_colour_and_may_lack_a_grid(
     np.testing.assert_allclose(points_of(recording, frame)[0], points_m.reshape(-1, 3), atol=1e-6)
     assert frame.rgb is not None
     assert (frame.rgb == (16, 32, 48)).all()
+
+
+def test_a_packed_cloud_has_the_grid_of_a_plain_one(tmp_path: Path) -> None:
+    plain = open_capture([plane.write_pcd(tmp_path / "plain.pcd", TRUE_M)])
+    packed = open_capture([plane.write_packed_pcd(tmp_path / "packed.pcd", TRUE_M)])
+    plain_frame = next(plain.frames())
+    packed_frame = next(packed.frames())
+    assert packed.organised
+    assert packed.lens == plain.lens
+    np.testing.assert_array_equal(packed_frame.z_m, plain_frame.z_m)
+    np.testing.assert_array_equal(packed_frame.rgb, plain_frame.rgb)
 
 
 def test_lists_of_points_without_a_lens_have_no_grid(tmp_path: Path) -> None:
@@ -247,6 +261,28 @@ def test_frames_stream_in_the_order_of_their_numbers_and_start_again(tmp_path: P
 def test_a_recording_can_be_sent_to_another_process(tmp_path: Path) -> None:
     recording = pickle.loads(pickle.dumps(open3d(tmp_path)))
     np.testing.assert_allclose(points_of(recording, next(recording.frames())), TRUE_M, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        # from 0 to 1
+        ([0.0, 0.5, 1.0], [0, 128, 255]),
+        # from 0 to 255, with what lies beyond and what is unknown
+        ([-3.0, 127.6, 300.0], [0, 128, 255]),
+        ([np.nan, 1.0, 255.0], [0, 1, 255]),
+    ],
+)
+def test_colours_that_are_no_whole_numbers_become_bytes(
+    tmp_path: Path, levels: list[float], expected: list[int]
+) -> None:
+    path = tmp_path / "c.npz"
+    rgb = np.broadcast_to(levels, (72, 96, 3)).astype(np.float32)
+    np.savez(path, depth=(STORED / 1e3).astype(np.float32), rgb=rgb)
+    seen = next(open_capture([path], lens=plane.LENS).frames()).rgb
+    assert seen is not None
+    assert seen.dtype == np.uint8
+    assert (seen == expected).all()
 
 
 def test_colour_that_belongs_to_no_depth_picture_is_said(tmp_path: Path) -> None:

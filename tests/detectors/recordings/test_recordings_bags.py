@@ -409,6 +409,9 @@ def test_depth_images_without_their_lens_are_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=40, deadline=None)
 @example(form="rvl", cut=0.005, share=0.0, byte=0)  # ends within the width
+@example(form="png", cut=1.0, share=0.0, byte=0)  # whole
+@example(form="rvl", cut=1.0, share=0.0, byte=0)
+@example(form="rvl", cut=1.0, share=1.0, byte=1)  # another number at the end
 @given(
     form=st.sampled_from(("png", "rvl")),
     cut=st.floats(0, 1),
@@ -425,10 +428,15 @@ def test_a_damaged_compressed_image_is_read_or_told(
     data = message.data.copy()
     data[int(share * (data.size - 1))] ^= byte
     message.data = data[: int(cut * data.size)]
+    is_whole = cut == 1.0 and byte == 0
     try:
-        assert stored_depth("m", message).dtype == np.uint16
+        depth = stored_depth("m", message)
     except UserError as mistake:
         assert str(mistake)
+        assert not is_whole
+    else:
+        assert depth.dtype == np.uint16
+        assert not is_whole or np.array_equal(depth, STORED)
 
 
 @pytest.mark.parametrize("part", (0.0, 0.001, 0.3, 0.9, 0.999))

@@ -81,6 +81,9 @@ CAMERA_SIZES = (
     ("SXGA", 1280, 1024),
 )
 
+CROWDED_OUT = ("RealSense D4xx", "1.2 megapixels")
+"""Cameras whose pixels with other bytes between are those of four smaller pictures as well."""
+
 
 @pytest.mark.parametrize(("name", "width", "height"), CAMERA_SIZES)
 def test_the_layouts_of_usual_cameras_are_offered(
@@ -92,13 +95,12 @@ def test_the_layouts_of_usual_cameras_are_offered(
         with path.open("wb") as file:
             file.truncate(width * height * pixel_bytes)
         fix = raw_layout_of(path).fix or ""
-        offered = [f"--raw {text}" for text in fix.split("--raw ")[1:]]
+        offered = [f"--raw {text}".removesuffix(" or ") for text in fix.split("--raw ")[1:]]
         stated = f"--raw {width}x{height}{layout}"
-        if pixel_bytes == 2:
-            assert stated in [text.removesuffix(" or ") for text in offered], name
-        else:
-            # at most four are printed
-            assert stated in [text.removesuffix(" or ") for text in offered] or len(offered) == 4
+        is_crowded_out = name in CROWDED_OUT and pixel_bytes > 2
+        assert (stated in offered) != is_crowded_out
+        # at most four are printed
+        assert len(offered) == 4 or not is_crowded_out
         with path.open("wb") as file:
             file.truncate(width * height * pixel_bytes + 1)
         assert f"--raw {width}x{height}{layout} " not in (raw_layout_of(path).fix or "") + " "

@@ -12,7 +12,8 @@ import pytest
 from detectors.surfaces.background import Background, background, misfit
 from detectors.surfaces.surface import SurfaceConfig
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud
+from tests.support.plain_clouds import cloud_of_points
 
 SHAPE = (144, 160)
 FOCAL_PX = 140.0
@@ -61,16 +62,7 @@ def cloud_of(z: np.ndarray, points_m: np.ndarray | None = None) -> Cloud:
     """The cloud of a depth map, or of the points."""
     if points_m is None:
         points_m = np.stack([X * z, Y * z, z], axis=-1)
-    shape = points_m.shape[:2]
-    return Cloud(
-        points_m=points_m,
-        reason=np.zeros(shape, np.uint8),
-        count=np.ones(shape, int),
-        variance_m2=np.full(shape, np.nan),
-        region=Region(0, shape[0], 0, shape[1]),
-        z_step_m=0.0,
-        n_frames=1,
-    )
+    return cloud_of_points(points_m)
 
 
 def measured(

@@ -87,6 +87,12 @@ def test_shared_noise_counts_once() -> None:
     np.testing.assert_allclose(shared.noise_m, 2.0 * alone.noise_m, rtol=1e-9)
 
 
+def test_noise_that_all_points_of_a_place_share_is_that_of_one_point() -> None:
+    """Some 40 points lie in a cylinder, fewer than would share their noise."""
+    measured = compared(sheet(8000), sheet(8000), share=1e4)
+    assert np.median(measured.noise_m) == pytest.approx(0.3 * MM * np.sqrt(2.0), rel=0.03)
+
+
 def test_a_place_with_few_points_is_not_judged() -> None:
     measured = compared(sheet(4000), sheet(60))
     assert np.isnan(measured.distance_m).mean() > 0.9

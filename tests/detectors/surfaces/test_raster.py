@@ -3,24 +3,15 @@
 import numpy as np
 
 from detectors.surfaces.smooth_surfaces import CELL_SPACINGS, raster
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud
+from tests.support.plain_clouds import cloud_of_points
 
 STEP = 1.0 / 256.0  # exact, so that cells can be told by hand
 SIDE = 40
 
 
 def _cloud(points_m: np.ndarray) -> Cloud:
-    n = len(points_m)
-    return Cloud(
-        points_m=points_m[None],
-        reason=np.zeros((1, n), np.uint8),
-        count=np.ones((1, n), int),
-        variance_m2=np.full((1, n), np.nan),
-        region=Region(0, 1, 0, n),
-        z_step_m=1e-3,
-        n_frames=7,
-        organised=False,
-    )
+    return cloud_of_points(points_m[None], z_step_m=1e-3, n_frames=7, organised=False)
 
 
 def _square(z_m: float = 1.0) -> np.ndarray:

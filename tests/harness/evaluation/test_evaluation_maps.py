@@ -254,6 +254,24 @@ def test_maps_side_by_side(small):
     assert row["views_left_out"] == 0
 
 
+def test_runs_of_a_map_have_a_typical_time_and_a_scatter_of_noise(small):
+    """A single slow run does not count; the noise of runs scatters by 0.1 mm."""
+    runs = small.runs.copy()
+    chosen = (runs["variant"] == name_of(2, "cpd", "fusion")) & (runs["role"] == "damaged")
+    is_odd = runs["repeat"] % 2 == 1
+    runs.loc[chosen, "seconds_map"] = np.where(runs["repeat"] == 0, 60.0, 2.0)[chosen]
+    runs.loc[chosen, "surface_noise_mm"] = np.where(is_odd, 0.4, 0.6)[chosen]
+    runs.loc[chosen, "views_left_out"] = np.where(is_odd, 1, 0)[chosen]
+    changed = replace(small, runs=runs)
+    compared = compare_maps(changed, summarise_holes(small.holes, [VIEWS, REGISTRATION, MERGE]))
+    row = compared[compared["variant"] == name_of(2, "cpd", "fusion")].iloc[0]
+    count = (chosen & (runs["frames"] == row["frames"])).sum()
+    assert count % 2 == 0
+    assert row["seconds_map"] == 2.0
+    assert row["surface_std_mm"] == pytest.approx(0.1 * np.sqrt(count / (count - 1)))
+    assert row["views_left_out"] == 0.5
+
+
 def test_other_axes_make_places_of_their_own(small):
     axes = [
         *small.axes.to_dict("records"),
@@ -416,6 +434,9 @@ def test_size_errors_of_some_holes() -> None:
     assert errors.change(np.array([False, True])).mean == -0.25
     assert errors.change().mean == 0.25
     assert errors.change(np.array([False, False])).n == 0
+    # of a repeat in which a hole was not measured, the mean is of the others
+    without_one = replace(errors, differences_mm=np.array([[0.5, np.nan], [1.0, 0.0]]))
+    assert without_one.change().mean == 0.5
 
 
 def test_a_ratio_needs_the_actual_and_the_predicted_error() -> None:

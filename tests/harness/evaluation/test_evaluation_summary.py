@@ -75,6 +75,19 @@ def test_false_calls_with_poisson_interval() -> None:
     assert damaged["quiet_highest"] == 5.0
 
 
+def test_threshold_and_noise_of_runs_are_means() -> None:
+    """Half of the runs have three times the noise of the others, and half the threshold."""
+    runs = tables(frames=(1,)).runs
+    is_damaged = runs["role"] == "damaged"
+    is_noisy = is_damaged & (runs["repeat"] < 25)
+    runs.loc[is_damaged, ["surface_noise_mm", "threshold", "scale_mm"]] = [1.0, 6.0, 0.5]
+    runs.loc[is_noisy, ["surface_noise_mm", "threshold", "scale_mm"]] = [3.0, 3.0, 1.5]
+    damaged = false_calls(runs).set_index("role").loc["damaged"]
+    assert damaged["surface_noise_mm"] == pytest.approx(2.0)
+    assert damaged["threshold"] == pytest.approx(4.5)
+    assert damaged["threshold_mm"] == pytest.approx((3.0 + 4.5) / 2)
+
+
 def test_hole_free_runs_at_a_given_threshold_are_counted() -> None:
     runs = tables(frames=(1,)).runs
     runs.loc[runs["role"] == "hole_free", ["threshold", "false_calls"]] = [3.0, 2]

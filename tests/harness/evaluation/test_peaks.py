@@ -10,6 +10,7 @@ from harness.evaluation.intervals import threshold_for_rate
 from harness.evaluation.peaks import (
     LEVEL,
     ScoreTail,
+    _sandwich,
     fitted_tail,
     is_uneven,
     threshold_from_peaks,
@@ -85,6 +86,44 @@ def test_scores_that_contradict_the_tail_are_set_by_order_statistics() -> None:
     assert threshold.interval_per_m2.low == pytest.approx(0.19, abs=0.01)
     assert threshold.interval_per_m2.high == pytest.approx(2.2, abs=0.1)
     assert threshold.error > 0
+
+
+def test_the_error_of_order_statistics_is_a_quarter_of_four_standard_errors() -> None:
+    """Single scores in steps of 0.1, of which eight of 100 may be exceeded: their number has a
+    standard error of 3, so that scores with two errors more and fewer above lie 1.2 apart."""
+    peaks = [[5.0 + 0.1 * number] for number in range(100)]
+    rate_per_m2 = -np.log(1 - 9.5 / 101) / AREA_M2
+    threshold = threshold_from_peaks(peaks, AREA_M2, rate_per_m2)
+    assert threshold.method == "order statistics"
+    assert threshold.value == pytest.approx(5.0 + 0.1 * 91)
+    assert threshold.error == pytest.approx(0.3)
+    low, high = stats.beta.ppf([0.025, 0.975], 9, 92)
+    assert threshold.interval_per_m2.low == pytest.approx(-np.log(1 - low) / AREA_M2)
+    assert threshold.interval_per_m2.high == pytest.approx(-np.log(1 - high) / AREA_M2)
+
+
+def test_the_covariance_of_a_mean_is_that_of_boards_over_their_number() -> None:
+    """A likelihood whose maximum is the mean of the boards' numbers."""
+    numbers = np.random.default_rng(4).normal([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], (7, 3))
+
+    def of_boards(parameters: np.ndarray) -> np.ndarray:
+        return -0.5 * ((parameters - numbers) ** 2).sum(axis=1)
+
+    covariance = _sandwich(of_boards, numbers.mean(axis=0))
+    np.testing.assert_allclose(covariance, np.cov(numbers.T) / 7, rtol=1e-6, atol=1e-12)
+
+
+def test_many_boards_show_a_heavy_tail_whatever_was_expected() -> None:
+    """Squares with a Pareto tail of shape 0.3, three deviations from what the penalty expects:
+    2,000 boards of ten scores outweigh it."""
+    random = np.random.default_rng(5)
+    counts = np.cumsum(random.exponential(size=(2000, 10)), axis=1)
+    squares = 16.0 + 2.0 * np.expm1(-0.3 * np.log(counts)) / 0.3
+    tail = fitted_tail(np.sqrt(squares).tolist())
+    assert tail is not None
+    assert tail.shape == pytest.approx(0.3, abs=0.03)
+    assert tail.location == pytest.approx(16.0, abs=0.2)
+    assert np.exp(tail.log_scale) == pytest.approx(2.0, rel=0.05)
 
 
 def test_few_boards_or_scores_have_no_tail() -> None:

@@ -3,7 +3,7 @@
 import argparse
 import math
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,12 +12,14 @@ from detectors import load_detector
 from detectors.findings.beside_joints import TouchingDamage
 from detectors.findings.joints import Joints
 from detectors.findings.null import OwnThreshold, own_threshold
-from detectors.interface import Detection, Detector, Measurement
+from detectors.interface import Detection, Detector, Evidence, Measurement, MissingReturns
 from harness.inspection import judging
-from harness.inspection.judging import judged, null_facts, threshold_of
+from harness.inspection.judging import _without_features, judged, null_facts, threshold_of
 from harness.report.findings import Judged
 from harness.vocabulary.files import plain_json
+from harness.vocabulary.geometry import ExpectedSurface, Lens
 from tests.harness.inspection.test_verdict import judged_of
+from tests.support.plain_clouds import cloud_of_points
 from tests.validation.odds import Case, capture
 
 DETECTOR = load_detector("matched", {"crop": {"kind": "none"}, "surface": {"degree": 1}})
@@ -87,6 +89,56 @@ def test_calls_at_marks_are_stated_apart() -> None:
     assert null["at_marks"] > 0.05
     assert null["expected"] == pytest.approx(1.0 + null["at_marks"], rel=1e-6)
     assert "of them at objects, print and edges, from" in origin
+
+
+def threshold_by(monkeypatch: pytest.MonkeyPatch, **changed: Any) -> tuple[float, str, Evidence]:
+    """The threshold of a capture whose own one is as ``changed``."""
+    stated = replace(own(1.0), **changed)
+    monkeypatch.setattr(judging, "own_threshold", lambda *_: stated)
+    return threshold_of(arguments(), DETECTOR, CLOUD, EVIDENCE, never)
+
+
+@pytest.mark.parametrize(("at_marks", "told"), [(0.049, ""), (0.05, ", 0.05 of them at objects")])
+def test_calls_at_marks_are_told_from_a_twentieth(
+    monkeypatch: pytest.MonkeyPatch, at_marks: float, told: str
+) -> None:
+    _, origin, _ = threshold_by(monkeypatch, at_marks=at_marks, expected=1.0, low=0.0, high=4.0)
+    assert f"1.0 false calls expected (0 to 4){told}" in origin
+    assert ("at objects" in origin) == bool(told)
+
+
+@pytest.mark.parametrize(("own_k", "used"), [(3.2, 5.0), (7.5, 7.5), (math.nan, 5.0)])
+def test_a_threshold_in_doubt_is_at_least_five_deviations(
+    monkeypatch: pytest.MonkeyPatch, own_k: float, used: float
+) -> None:
+    doubts = ("only 3 peaks of noise stand out",)
+    k, origin, evidence = threshold_by(monkeypatch, threshold=own_k, doubts=doubts)
+    assert k == used
+    assert origin.startswith(f"a fallback, {used:g} units of score: the number of false calls is")
+    told = f"the capture cannot set its own threshold, {used:g} is used: {doubts[0]}"
+    assert evidence.warnings[-1] == told
+
+
+@pytest.mark.parametrize(("shown", "is_finding"), [(1, False), (2, True), (4, True)])
+def test_missing_returns_are_findings_if_the_reference_shows_half_of_them(
+    shown: int, is_finding: bool
+) -> None:
+    """Four pixels without a return, of which the reference shows some."""
+    lens = Lens(60, 40, 500.0, 500.0, 29.5, 19.5)
+    pixels = 60 * 20 + np.arange(10, 14)
+    edge = (10 + shown - 0.5 - lens.cx) / lens.fx
+
+    def z_at(rays: np.ndarray) -> np.ndarray:
+        return np.where(rays[:, 0] < edge, 1.0, np.nan)
+
+    reference = ExpectedSurface("a part", z_at, np.zeros_like, np.zeros_like)
+    points = np.concatenate([lens.region_slopes(lens.whole), np.ones((40, 60, 1))], axis=-1)
+    cloud = cloud_of_points(points, lens=lens, expected=reference)
+    blind = Detection(6.0, pixels, np.zeros(3), kind="no return")
+    everything = np.ones((40, 60), bool)
+    missing = MissingReturns(everything, np.zeros((40, 60)), 0.0, 0.0, 4, 0.001, (blind,))
+    kept = _without_features(cloud, missing).detections
+    assert kept == ((blind,) if is_finding else ())
 
 
 class Finds:

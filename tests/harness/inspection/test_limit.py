@@ -16,6 +16,7 @@ from harness.inspection.limit import (
     Disc,
     SizeCount,
     fitted,
+    found_at,
     free_area,
     limit_of,
     next_step,
@@ -24,7 +25,8 @@ from harness.inspection.limit import (
 )
 from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Cloud
+from tests.support.plain_clouds import cloud_of_points
 
 PITCH_M = 0.002
 SHAPE = (120, 160)
@@ -36,16 +38,8 @@ def plane_cloud(slope: float = 0.0, reach_px: float = 0.0) -> Cloud:
     across = (u - 79.5) * PITCH_M
     down = (v - 59.5) * PITCH_M
     z = 1.0 / (1 - slope * across)
-    return Cloud(
-        points_m=np.stack([across * z, down * z, z], axis=-1),
-        reason=np.zeros(SHAPE, np.uint8),
-        count=np.ones(SHAPE, int),
-        variance_m2=np.full(SHAPE, 1e-6),
-        region=Region(0, SHAPE[0], 0, SHAPE[1]),
-        z_step_m=0.0,
-        n_frames=1,
-        noise_reach_px=reach_px,
-    )
+    points = np.stack([across * z, down * z, z], axis=-1)
+    return cloud_of_points(points, noise_reach_px=reach_px)
 
 
 @dataclass(frozen=True)
@@ -155,6 +149,30 @@ def test_the_limit_is_the_detectors_own() -> None:
     assert widths == sorted(widths) and {size.depth_mm for size in limit.sizes} == {4.0}
     assert limit.text.startswith("damage 4 mm deep is found in 90 % of places from ")
     assert limit.facts["sizes"][0]["hits"] == 0
+
+
+def test_discs_that_uncertain_steps_explain_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in an inspection, where such findings are left out."""
+    detector = WidthDetector()
+    result = judged_of(detector, plane_cloud())
+    size = {"diameter_m": 0.02, "depth_m": 0.004}
+    count = found_at(detector, result, 1.0, **size)
+    assert count is not None
+    assert count.hits == count.places > 10
+
+    def all_but_the_first(
+        cloud: Cloud, evidence: Evidence, detections: tuple[Detection, ...], threshold: float
+    ) -> tuple[int, ...]:
+        assert evidence.score.shape == cloud.valid.shape
+        assert threshold == 1.0
+        return tuple(range(1, len(detections)))
+
+    monkeypatch.setattr("harness.inspection.limit.at_steps", all_but_the_first)
+    explained = found_at(detector, result, 1.0, **size)
+    assert explained is not None
+    # one in each of the clouds that together have as many places
+    assert 0 < explained.hits < count.hits / 2
+    assert explained.places == count.places
 
 
 def test_without_a_depth_discs_are_half_as_deep_as_wide() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,26 @@ import numpy as np
 import pytest
 import trimesh
 
+from detectors.interface import Evidence
+from detectors.surfaces.scans import laid_under, scan_of
 from harness import detect
 from harness.inspection.arguments import is_mesh
-from harness.inspection.changes import GONE, GROWN, NEW, SHRUNK, DamageSize, _change, _departure_m
+from harness.inspection.changes import (
+    GONE,
+    GROWN,
+    NEW,
+    SHRUNK,
+    DamageSize,
+    _change,
+    _departure_m,
+    _rest,
+    changes_of,
+)
 from harness.inspection.references import captures_in
+from harness.report.findings import Judged
 from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support import marked_board
-from tests.support.made_parts import Dent, MadePart, pose, write_capture
+from tests.support.made_parts import Dent, MadePart, cloud_of, pose, write_capture
 
 THEN = MadePart((Dent(0, 0, 14, 1.0), Dent(20, -30, 12, 2.5), Dent(-15, -30, 12, 1.5)))
 NOW = MadePart((Dent(0, 0, 18, 2.5), Dent(20, -30, 12, 2.5), Dent(40, 10, 12, 1.5)))
@@ -77,11 +91,13 @@ def test_features_of_good_parts_are_no_findings(
     captures: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = inspected(captures, "good", "compared")
-    # nothing else stands above the threshold, and each of them clearly
-    assert len(data["findings"]) == 3
-    assert {finding["term"] for finding in data["findings"]} == {"dent"}
-    scores = [finding["score"] for finding in data["findings"]]
-    assert min(scores) > 2 * data["threshold"]["k"]
+    threshold = data["threshold"]["k"]
+    clear = [finding for finding in data["findings"] if finding["score"] > 2 * threshold]
+    assert [finding["term"] for finding in clear] == ["dent"] * 3
+    # one false call is expected at this threshold, and none stands far above it
+    others = [finding["score"] for finding in data["findings"] if finding not in clear]
+    assert len(others) <= 1
+    assert all(score < 1.2 * threshold for score in others)
     assert data["surface"]["reference"]["parts"] == 4
     assert data["change"] is None
     assert "on 4 good parts, each left out once" in capsys.readouterr().out
@@ -176,6 +192,40 @@ def test_states(
     if change_mm == 1.5 and now_mm == 2.5:
         assert change.then is not None
         assert change.then.depth_mm == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("depth_mm", "is_left"), [(1.29, True), (1.27, False), (-1.29, True)])
+def test_what_is_left_of_a_damage_exceeds_two_standard_errors(
+    depth_mm: float, is_left: bool
+) -> None:
+    """Depth and change have errors of 0.1 mm each: 0.28 mm is twice that of their difference."""
+    size = DamageSize(10.0, depth_mm, 0.1)
+    change = DamageSize(10.0, math.copysign(1.0, depth_mm), 0.1)
+    rest = _rest(size, change, -1.0)
+    assert (rest is not None) == is_left
+    if rest is not None:
+        assert rest.depth_mm == pytest.approx(math.copysign(0.29, depth_mm))
+        assert rest.depth_se_mm == pytest.approx(0.1 * math.sqrt(2.0))
+        assert math.isnan(rest.diameter_mm)
+
+
+def test_pixels_that_share_their_noise_count_once_in_a_change() -> None:
+    """Cylinders hold 20 points of the earlier capture. If nine pixels of the later one share their
+    noise, the variance of its mean is nine times as large, that of the difference five times."""
+    earlier, earlier_mask = cloud_of(MadePart(), pose(), seed=1)
+    scan = scan_of(earlier, earlier_mask, "earlier")
+    seen, mask = cloud_of(MadePart(), pose((4.0, -3.0, 5.0)), seed=2)
+    seen = replace(seen, expected=laid_under(scan, seen, mask))
+    residual_m = np.where(mask, 0.0, np.nan)
+    noise_m = []
+    for reach_px in (1.0, 3.0):
+        cloud = replace(seen, noise_reach_px=reach_px)
+        evidence = Evidence(residual_m, residual_m, cloud.points_m[..., 2], 1e-3)
+        capture = Judged(cloud, evidence, (), ())
+        changes = changes_of(capture, scan, capture, capture)
+        assert changes.radius_m == pytest.approx(math.sqrt(20 / math.pi) * scan.pitch_m)
+        noise_m.append(np.nanmedian(changes.distances.noise_m))
+    assert noise_m[1] / noise_m[0] == pytest.approx(math.sqrt(5.0), rel=0.06)
 
 
 def test_a_departure_is_that_of_the_core_from_the_ring_around_it() -> None:

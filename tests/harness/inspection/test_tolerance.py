@@ -31,14 +31,16 @@ from harness.inspection.tolerance import (
     _of_volume,
     combined,
     decided,
+    deviations_mm,
     part_decision,
     tolerances_from,
 )
 from harness.inspection.verdict import DOUBTFUL, SURE
+from harness.report.findings import Judged
 from harness.vocabulary.errors import UserError
 from tests.detectors.surfaces.test_drawing import casting, stood
 from tests.detectors.surfaces.test_drawing import seen as casting_seen
-from tests.harness.inspection.test_verdict import finding, judged_of
+from tests.harness.inspection.test_verdict import evidence_of, finding, judged_of, plane_cloud
 from tests.support.made_parts import Dent, MadePart, pose, write_capture
 from tests.validation.tolerance_risks import decided_on
 
@@ -60,6 +62,11 @@ def at_both(hits: int) -> Missed:
 def test_the_guard_band_is_1_645_standard_uncertainties(value_mm: float, decision: str) -> None:
     assert pytest.approx(1.645, abs=1e-3) == GUARD
     assert decided(value_mm, GUARD * 0.1, 0.5) == decision
+
+
+def test_a_size_whose_guard_band_ends_at_the_limit_is_accepted_and_not_rejected() -> None:
+    assert decided(0.25, 0.25, 0.5) == CONFORMS
+    assert decided(0.75, 0.25, 0.5) == UNDECIDED
 
 
 def test_a_size_at_the_limit_is_decided_wrongly_as_often_as_stated() -> None:
@@ -184,6 +191,22 @@ def test_volume_and_deviation_are_those_of_a_dent(tmp_path: Path) -> None:
     result = judged(detector, undamaged, detector.analyse(undamaged), 6.0)
     (deviation,) = part_decision(result, tolerances[1:], Missed("", is_irrelevant=True)).findings
     assert deviation.decision == CONFORMS
+
+
+def test_deviations_are_distances_across_the_surface() -> None:
+    """Points 2 mm behind a surface at 45 degrees, along z: by parallel rays, and by the rays of a
+    camera, which meet it the more flatly the farther they lie on its side."""
+    cloud = plane_cloud(slope=1.0, projection="parallel")
+    residual_m = np.full(cloud.valid.shape, 2e-3)
+    judged_cloud = Judged(cloud, evidence_of(cloud, residual_m=residual_m), (), ())
+    assert deviations_mm(judged_cloud) == pytest.approx(2.0 / math.sqrt(2.0))
+
+    seen = plane_cloud(slope=1.0)
+    judged_cloud = Judged(seen, evidence_of(seen, residual_m=residual_m), (), ())
+    slope_of_ray = seen.points_m[..., 0] / seen.points_m[..., 2]
+    expected_mm = 2.0 * (1.0 - slope_of_ray) / math.sqrt(2.0)
+    assert np.ptp(expected_mm) > 0.1
+    assert deviations_mm(judged_cloud) == pytest.approx(expected_mm)
 
 
 def test_growth_is_decided_and_what_is_gone_counts_as_none(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from harness.inspection.verdict import (
 )
 from harness.report.findings import Finding, Judged
 from harness.vocabulary.geometry import Cloud, Region
+from tests.support.plain_clouds import cloud_of_points
 
 NULL = {"threshold": 5.0, "expected": 1.0, "low": 0.0, "high": 4.0}
 PITCH_M = 0.002
@@ -67,16 +68,7 @@ def plane_cloud(slope: float = 0.0, projection: str = "central") -> Cloud:
         points = np.stack([across * z / Z_M, down * z / Z_M, z], axis=-1)
     else:
         points = np.stack([across, down, Z_M + slope * across], axis=-1)
-    return Cloud(
-        points_m=points,
-        reason=np.zeros((40, 60), np.uint8),
-        count=np.ones((40, 60), int),
-        variance_m2=np.full((40, 60), 1e-6),
-        region=Region(0, 40, 0, 60),
-        z_step_m=0.0,
-        n_frames=1,
-        projection=projection,  # type: ignore[arg-type]
-    )
+    return cloud_of_points(points, projection=projection)
 
 
 def evidence_of(cloud: Cloud, **fields: object) -> Evidence:
@@ -110,12 +102,12 @@ def judged_of(*scores: float, rows: tuple[int, ...] = ()) -> Judged:
 
 
 def test_findings_with_unknown_odds_are_faint_up_to_one_and_a_half_times_the_threshold() -> None:
-    result = with_remarks(judged_of(8.9, 9.1), 6.0)
+    result = with_remarks(judged_of(8.9, 9.0), 6.0)
     assert [remarked.certainty for remarked in result.findings] == ["doubtful", "sure"]
     assert [remarked.flags for remarked in result.findings] == ["faint", ""]
 
 
-@pytest.mark.parametrize(("odds", "certainty"), [(0.049, "sure"), (0.051, "doubtful")])
+@pytest.mark.parametrize(("odds", "certainty"), [(0.049, "sure"), (0.05, "doubtful")])
 def test_known_odds_decide_whatever_the_score(odds: float, certainty: str) -> None:
     for score in (1.0, 99.0):
         judged_finding = finding(noise_probability=odds, score=score)
@@ -151,21 +143,37 @@ def test_blur_carries_a_finding_to_the_rim_by_half_of_its_width() -> None:
     assert flags == ["at_rim", "at_rim"]
 
 
-def test_flags_say_how_a_size_was_measured_and_what_shows_through() -> None:
-    def flags(**fields: object) -> tuple[str, ...]:
-        return flags_of(finding(**fields), is_cut=False, least_score=5.0)
+def flags(**fields: object) -> tuple[str, ...]:
+    """The flags of a finding inside the rim, but for ``fields`` the sure round hole."""
+    return flags_of(finding(**fields), is_cut=False, least_score=5.0)
 
+
+def test_a_plain_finding_has_no_flag() -> None:
     assert flags() == ()
+
+
+def test_flags_say_how_size_and_depth_were_measured() -> None:
     assert flags(size_from="contour") == ("size_from_contour",)
-    assert flags(size_from="extent", depth_from="extreme residual") == (
-        "size_from_extent",
-        "depth_from_extreme",
-    )
+    by_points = flags(size_from="extent", depth_from="extreme residual")
+    assert by_points == ("size_from_extent", "depth_from_extreme")
     assert flags(depth_is_least=True) == ("depth_at_least",)
-    assert flags(depth_mm=75.1) == ("open_behind",) and flags(depth_mm=74.9) == ()
-    assert flags(depth_se_mm=2.6) == () and flags(depth_se_mm=2.7) == ("depth_open",)
-    bump = finding(kind="bump", depth_mm=-3.0, depth_se_mm=1.1)
-    assert flags_of(bump, is_cut=False, least_score=5.0) == ("depth_open",)
+
+
+def test_a_hole_is_open_behind_beyond_75_mm() -> None:
+    assert flags(depth_mm=75.0) == ()
+    assert flags(depth_mm=75.1) == ("open_behind",)
+
+
+@pytest.mark.parametrize(("kind", "depth_mm"), [("hole", 3.0), ("bump", -3.0)])
+def test_a_depth_is_open_if_its_error_is_more_than_a_third_of_it(
+    kind: str, depth_mm: float
+) -> None:
+    assert flags(kind=kind, depth_mm=depth_mm, depth_se_mm=0.9) == ()
+    assert flags(kind=kind, depth_mm=depth_mm, depth_se_mm=1.1) == ("depth_open",)
+
+
+def test_what_returns_no_light_is_open_behind_and_no_noise() -> None:
+    """A score below that of faint findings makes it none of these."""
     blind = finding(kind="no return", depth_mm=math.nan, score=1.0)
     assert flags_of(blind, is_cut=False, least_score=5.0) == ("open_behind",)
     assert verdict.class_of(blind, ("open_behind",)) == "rim or blind"

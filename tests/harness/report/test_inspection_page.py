@@ -27,8 +27,9 @@ from harness.report.inspection_page import (
     deviation_view,
     numbered_picture,
 )
-from harness.vocabulary.geometry import Cloud, Region
+from harness.vocabulary.geometry import Region
 from tests.support import recorded_plane as plane
+from tests.support.plain_clouds import cloud_of_points
 
 
 def judged_of(rgb: bool = False, amplitude: bool = False, organised: bool = True) -> Judged:
@@ -40,14 +41,9 @@ def judged_of(rgb: bool = False, amplitude: bool = False, organised: bool = True
     residual[8:22, 10:40] = 0.0
     residual[10:14, 20:24] = 5e-3
     pixels = np.flatnonzero(residual.ravel() > 1e-3)
-    cloud = Cloud(
-        points_m=points,
-        reason=np.zeros((30, 50), np.uint8),
-        count=np.ones((30, 50), int),
-        variance_m2=np.full((30, 50), 1e-6),
+    cloud = cloud_of_points(
+        points,
         region=Region(100, 130, 200, 250),
-        z_step_m=0.0,
-        n_frames=1,
         rgb=np.full((30, 50, 3), 80.0) if rgb else None,
         amplitude=np.full((30, 50), 9.0) if amplitude else None,
     )

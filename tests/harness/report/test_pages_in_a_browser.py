@@ -122,7 +122,9 @@ def test_a_headline_has_at_most_twenty_words(written: dict[str, Path], name: str
 def test_a_figure_takes_its_colours_from_the_page() -> None:
     """Without an image, which keeps its colours, a figure has no colour of its own."""
     page = page_texts()["study"]
-    for figure in re.findall(r'<figure id="(?:limits|overlay|axis-1)">.*?</figure>', page, re.S):
+    figures = re.findall(r'<figure id="(?:limits|overlay|axis-1)">.*?</figure>', page, re.S)
+    assert len(figures) == 3
+    for figure in figures:
         colours = re.findall(r"(?:fill|stroke): (#\w+)", figure)
         assert colours == []
         assert re.search(r"(?:fill|stroke): var\(--blue, #0072b2\)", figure)

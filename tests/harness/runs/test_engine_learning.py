@@ -192,8 +192,8 @@ def test_every_unit_inspects_every_damaged_board_and_others_have_units_of_their_
     }, "units share renders"
     at_5 = {point.digest: 5.0 for point in group.points}
     keys = [
-        {key for batch in one.then for key, _ in one.trials(batch, at_5)}
-        for one in (group, additional)
+        {key for batch in planned_group.then for key, _ in planned_group.trials(batch, at_5)}
+        for planned_group in (group, additional)
     ]
     assert keys[0] < keys[1], "a further unit leaves the trials of the others as they were"
 

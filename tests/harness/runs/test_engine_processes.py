@@ -50,7 +50,7 @@ def test_every_fault_costs_its_own_job_only():
     ]
     innocent = doubles(30)
     jobs = [
-        one for pair in zip(faults, innocent[: len(faults)], strict=True) for one in pair
+        job for pair in zip(faults, innocent[: len(faults)], strict=True) for job in pair
     ] + innocent[len(faults) :]
     result = run(LocalEngine(2, Limits(seconds=10.0, memory_mb=1000)), jobs)
     assert {name: ended.state for name, ended in result.items() if ended.state != "done"} == {
@@ -60,7 +60,7 @@ def test_every_fault_costs_its_own_job_only():
         "aborts": "crashed",
         "hangs": "timed out",
     }
-    assert [result[one.name].value for one in innocent] == [2 * n for n in range(30)]
+    assert [result[job.name].value for job in innocent] == [2 * n for n in range(30)]
     assert result["raises"].is_bug and result["raises"].why.rstrip().endswith("ValueError: a bug")
     assert "Traceback" in result["raises"].why
     assert not result["refuses"].is_bug and "to do: mend it" in result["refuses"].why
@@ -96,7 +96,7 @@ def test_quick_jobs_are_ready_before_the_last_has_ended():
     result = run(LocalEngine(1, Limits(seconds=8.0)), jobs)
     states = {name: ended.state for name, ended in result.items() if ended.state != "done"}
     assert states == {"kills_its_process": "crashed", "hangs": "timed out"}
-    assert [result[one.name].value for one in remainder] == [2 * n for n in range(40)]
+    assert [result[job.name].value for job in remainder] == [2 * n for n in range(40)]
 
 
 def test_time_and_memory_are_told():

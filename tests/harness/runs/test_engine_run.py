@@ -206,8 +206,9 @@ def test_resuming_from_any_state_ends_the_same(plan, tmp_path):
             assert {name for name in engine.begun if name.endswith(".npz")} == shown
 
 
-def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
+def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path, request):
     """Renders, calibrations and judged trials end badly at random; mended by running on."""
+    without_threshold = 0
     for seed in range(3):
         rng = random.Random(seed)
 
@@ -223,11 +224,14 @@ def test_whatever_fails_is_told_and_nothing_hangs(plan, tmp_path):
         reasons = {"a fault"}
         for failure in outcome.failures:
             if failure.what.startswith("threshold of "):
+                without_threshold += 1
                 assert re.match(r"(no|\d+) hole-free runs? ", failure.why)
                 reasons |= {failure.why, f"no threshold: {failure.in_short}"}
         assert {failure.why for failure in outcome.failures} <= reasons
         mended = go(plan, folder, Pretended(seed), retry_failed=True)
         assert mended.failures == [] and len(mended.finished) == trial_count(plan)
+    is_calibrated = "a given threshold" not in request.node.name
+    assert (without_threshold > 0) == is_calibrated
 
 
 def test_a_render_whose_process_dies_is_tried_once_more(plan, tmp_path):
@@ -291,8 +295,8 @@ def shards_of_unlike_machines(plan: SweepPlan, home: Path, factor: float) -> Pat
     """Two shards, each with a folder of its own, the second on a machine whose scores differ by a
     factor; merged into a third folder."""
     into = Journal(home / "into")
-    for number, own in ((1, 1.0), (2, factor)):
-        go(plan, home / str(number), Pretended(factor=own), shard=Shard(number, 2))
+    for number, own_factor in ((1, 1.0), (2, factor)):
+        go(plan, home / str(number), Pretended(factor=own_factor), shard=Shard(number, 2))
         assert not merge_into(into, Journal(home / str(number)), Counter()) or factor == 1.01
     return home / "into"
 
@@ -331,8 +335,8 @@ def test_shards_whose_thresholds_differ_by_more_are_judged_anew(plan, tmp_path):
     # groups that share their trials before thresholds also share them between shards
     leaders = [group.leader or group for group in plan.groups]
     shards = [
-        [id(leader) for leader, parts in zip(leaders, each, strict=True) if parts]
-        for each in judged
+        [id(leader) for leader, parts in zip(leaders, parts_of_leaders, strict=True) if parts]
+        for parts_of_leaders in judged
     ]
     pair = [
         group for group in leaders if all(id(group) in shard for shard in shards) and group.first

@@ -105,10 +105,10 @@ def test_the_same_shard_twice_or_beside_a_whole_sweep_is_refused(tmp_path):
     with locked(tmp_path, Shard(1, 3)):
         with locked(tmp_path, Shard(2, 3)):
             pass
-        for other in (Shard(1, 3), Shard(1, 1)):
+        for other_shard in (Shard(1, 3), Shard(1, 1)):
             with (
                 pytest.raises(UserError, match="another sweep is running"),
-                locked(tmp_path, other),
+                locked(tmp_path, other_shard),
             ):
                 pass
     with locked(tmp_path):
@@ -128,11 +128,11 @@ def two(home, tmp_path) -> tuple[Path, Path]:
 
 
 def test_merging_twice_copies_once(two, capsys):
-    other, into = two
-    assert merge.main([str(other), "--into", str(into)]) == 0
-    count = len(Journal(other / "journal"))
+    other_folder, into = two
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
+    count = len(Journal(other_folder / "journal"))
     assert f"{count} trials copied, 0 were already there" in capsys.readouterr().out
-    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
     assert f"0 trials copied, {count} were already there" in capsys.readouterr().out
     assert not [path for path in into.rglob("*.part*")]
 
@@ -140,12 +140,12 @@ def test_merging_twice_copies_once(two, capsys):
 def test_what_is_done_takes_the_place_of_what_is_not(two):
     from harness.runs.jobs import Ended
 
-    other, into = two
-    keys = trial_keys(Journal(other / "journal"))
+    other_folder, into = two
+    keys = trial_keys(Journal(other_folder / "journal"))
     Journal(into / "journal").write(
         keys[0], Ended("crashed", why="its process was ended by SIGKILL")
     )
-    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
     entry = Journal(into / "journal").read(keys[0])
     assert entry is not None and entry.state == "done"
 
@@ -153,34 +153,37 @@ def test_what_is_done_takes_the_place_of_what_is_not(two):
 def test_different_results_for_one_trial_are_told(two, capsys):
     from dataclasses import replace
 
-    other, into = two
-    journal = Journal(other / "journal")
+    other_folder, into = two
+    journal = Journal(other_folder / "journal")
     key = next(key for key in trial_keys(journal) if key.startswith("damaged"))
     entry = journal.read(key)
     assert entry is not None and entry.record is not None
-    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
     slower = {
         **entry.record,
         "runs": [{**run, "seconds_detect": 9.0} for run in entry.record["runs"]],
     }
     journal.write(key, replace(entry, value=record_text(slower)))
-    assert merge.main([str(other), "--into", str(into)]) == 0
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
     changed = {**entry.record, "runs": [{**run, "detections": 99} for run in entry.record["runs"]]}
     journal.write(key, replace(entry, value=record_text(changed)))
-    assert merge.main([str(other), "--into", str(into)]) == 1
+    assert merge.main([str(other_folder), "--into", str(into)]) == 1
     assert "1 trials have different results" in capsys.readouterr().err
 
 
 def test_mistakes_in_merging(two, tmp_path, capsys):
-    other, into = two
+    other_folder, into = two
     (tmp_path / "empty").mkdir()
     stranger = tmp_path / "c" / "tiny" / "0123456789abcdef"
-    shutil.copytree(other, stranger)
+    shutil.copytree(other_folder, stranger)
     for arguments, printed in (
         ([str(tmp_path / "empty"), "--into", str(into)], "has no journal"),
-        ([str(other), "--into", str(other)], "is the folder to merge into"),
-        ([str(other), str(stranger), "--into", str(into)], "different experiments"),
-        ([str(other), "--into", str(tmp_path / "elsewhere")], "must be in a folder of that name"),
+        ([str(other_folder), "--into", str(other_folder)], "is the folder to merge into"),
+        ([str(other_folder), str(stranger), "--into", str(into)], "different experiments"),
+        (
+            [str(other_folder), "--into", str(tmp_path / "elsewhere")],
+            "must be in a folder of that name",
+        ),
     ):
         assert merge.main(arguments) == 2
         assert printed in capsys.readouterr().err
@@ -189,10 +192,12 @@ def test_mistakes_in_merging(two, tmp_path, capsys):
 
 def test_an_experiment_that_is_no_utf8_is_copied_as_it_is(two):
     """The sweep that reads it says what is wrong with it."""
-    other, into = two
-    (other / "experiment.yaml").write_bytes(b"# tofpod experiment 1\nname: \xff\n")
-    assert merge.main([str(other), "--into", str(into)]) == 0
-    assert (into / "experiment.yaml").read_bytes() == (other / "experiment.yaml").read_bytes()
+    other_folder, into = two
+    (other_folder / "experiment.yaml").write_bytes(b"# tofpod experiment 1\nname: \xff\n")
+    assert merge.main([str(other_folder), "--into", str(into)]) == 0
+    assert (into / "experiment.yaml").read_bytes() == (
+        other_folder / "experiment.yaml"
+    ).read_bytes()
 
 
 def test_a_shard_of_the_thesis_target(tmp_path):

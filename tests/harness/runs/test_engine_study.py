@@ -260,11 +260,11 @@ def test_a_set_up_that_sees_nothing_is_told_and_costs_no_other(finished, tmp_pat
     record = record_of(
         experiment, plan, tables_of(records_of(tmp_path, outcome), experiment), failed, provenance
     )
-    (one,) = record.set_ups
+    (set_up,) = record.set_ups
     assert (
-        one.axes == {"source.camera.unit_seed": 1}
-        and one.failed == 0
-        and len(one.inspected.hit) == 20
+        set_up.axes == {"source.camera.unit_seed": 1}
+        and set_up.failed == 0
+        and len(set_up.inspected.hit) == 20
     )
     (printed,) = without_limit(experiment.points, outcome, failed, record.set_ups)
     assert printed.startswith(
@@ -295,18 +295,18 @@ def test_a_study_leaves_its_record_tables_and_report(finished):
     limits = pd.read_csv(folder / "limits.csv")
     assert limits["frames"].tolist() == [1, 2] and limits["inspections"].tolist() == [20, 20]
     assert read_record(folder.parent / "latest").digest == record.digest
-    assert [one.frames for one in record.set_ups] == [1, 2]
-    for one in record.set_ups:
-        assert sorted(set(one.inspected.board.tolist())) == [0, 1, 2, 3]
-        assert len(one.inspected.hit) == 20
+    assert [set_up.frames for set_up in record.set_ups] == [1, 2]
+    for set_up in record.set_ups:
+        assert sorted(set(set_up.inspected.board.tolist())) == [0, 1, 2, 3]
+        assert len(set_up.inspected.hit) == 20
         # a hole of 10 mm, seven pixels wide, cannot be missed; one of 2 mm is a pixel and a half
-        assert one.inspected.hit[one.inspected.diameter_mm > 10].all()
-        assert one.unflawed.board.tolist() == [0, 1, 2]
-        assert one.unflawed.area_m2 == pytest.approx(
+        assert set_up.inspected.hit[set_up.inspected.diameter_mm > 10].all()
+        assert set_up.unflawed.board.tolist() == [0, 1, 2]
+        assert set_up.unflawed.area_m2 == pytest.approx(
             0.054, abs=0.002
         )  # of 0.0619 m2, less a rim of four pixels
-        assert one.calibration_runs == 5
-        assert one.threshold_mm > 0.5
+        assert set_up.calibration_runs == 5
+        assert set_up.threshold_mm > 0.5
     assert record.set_ups[0].targets_digest == record.set_ups[1].targets_digest
     assert record.set_ups[0].frames_digest != record.set_ups[1].frames_digest
     runs = pd.read_parquet(folder / "runs.parquet")
@@ -425,20 +425,20 @@ def test_the_oracle_scores_one_everywhere(finished, tmp_path, monkeypatch):
     oracle = "detector={name: oracle, settings: {}}"
     record, tables = judged(finished.parent, tmp_path, monkeypatch, *ONE_FRAME, oracle)
     result = evaluate_study(record, tables, {})
-    (one,) = result.set_ups
+    (set_up,) = result.set_ups
     smallest = record.set_ups[0].inspected.diameter_mm.min()
     assert record.set_ups[0].inspected.hit.all()
     assert (record.set_ups[0].inspected.signal == 1).all()
-    assert (one.limit.a50_mm, one.limit.a90_mm) == (
+    assert (set_up.limit.a50_mm, set_up.limit.a90_mm) == (
         smallest,
         smallest,
-    ) and one.limit.hits == one.limit.inspections
+    ) and set_up.limit.hits == set_up.limit.inspections
     assert record.set_ups[0].unflawed.calls.sum() == 0
     assert tables.findings["score"].eq(1).all()
     assert len(tables.findings) == len(tables.holes)
-    assert one.roc.area == 1.0
-    assert one.pixels is not None
-    assert one.pixels.pro == 1.0
+    assert set_up.roc.area == 1.0
+    assert set_up.pixels is not None
+    assert set_up.pixels.pro == 1.0
 
 
 @pytest.mark.slow  # a Monte Carlo of 48 boards
@@ -469,10 +469,10 @@ def test_the_blind_detector_scores_what_chance_gives(finished, tmp_path, monkeyp
     assert stats.binomtest(int(hits.sum()), len(hits), by_chance).pvalue > 1e-3
     sites = tables.sites["detected"]
     assert stats.binomtest(int(sites.sum()), len(sites), by_chance).pvalue > 1e-3
-    (one,) = evaluate_study(record, tables, {}).set_ups
-    assert not one.limit.a90_95.demonstrated
-    assert one.chance is not None
-    assert one.chance.probability == pytest.approx(by_chance, rel=0.25)
+    (set_up,) = evaluate_study(record, tables, {}).set_ups
+    assert not set_up.limit.a90_95.demonstrated
+    assert set_up.chance is not None
+    assert set_up.chance.probability == pytest.approx(by_chance, rel=0.25)
 
 
 def poisson_p(count: int, mean: float) -> float:

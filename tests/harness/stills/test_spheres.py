@@ -69,20 +69,20 @@ def test_a_far_sphere_in_the_sun_is_measured_with_a_wide_interval():
     """145 mm at 3.5 m, noise of 10 mm, half of the pixels lost: 36 of 40 are found and 34 of 36
     intervals hold; here, eight."""
     centre_m = np.array([[0.05, 0.02, 3.5]])
-    held = 0
-    found = 0
+    covered = 0
+    fitted_count = 0
     for seed in range(8):
         image = sphere_scene(centre_m, RADIUS_M, 10e-3, 0.5, seed, lens=FAR, wall_m=5.0)
         for fit in find_spheres(image, RADIUS_M):
-            found += 1
+            fitted_count += 1
             ends = fit.size_interval_m
             assert 0.02 < ends.high - ends.low < 0.09
-            held += ends.low < 0 < ends.high
+            covered += ends.low < 0 < ends.high
             # ranges show curvature
             inverse = [1 / (2 * RADIUS_M + end_m) for end_m in (ends.low, ends.high)]
             assert np.mean(inverse) == pytest.approx(1 / (2 * fit.radius_m))
-    assert found >= 6
-    assert held >= found - 1
+    assert fitted_count >= 6
+    assert covered >= fitted_count - 1
 
 
 def test_half_a_sphere_on_a_wall_needs_more_evidence_than_one_alone():

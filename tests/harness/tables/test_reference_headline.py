@@ -58,13 +58,14 @@ def test_no_reference_is_praised_for_one_part() -> None:
 def test_a_gain_is_judged_over_boards() -> None:
     (gain, _) = reference_gains(limits_of({"flat": (8.0, 7.4, 5.0)}))
     limits = limits_of({"flat": (8.0, 7.4, 5.0)})
-    none, scan = (limit.record.inspected for limit in limits[:2])
+    without = limits[0].record.inspected
+    scan = limits[1].record.inspected
     difference = [
-        scan.hit[scan.board == n].sum() - none.hit[none.board == n].sum() for n in range(8)
+        scan.hit[scan.board == n].sum() - without.hit[without.board == n].sum() for n in range(8)
     ]
     mean = np.mean(difference)
     t = mean / (np.std(difference, ddof=1) / np.sqrt(8))
-    assert gain.shares - gain.without == pytest.approx([sum(difference) / len(none.hit)])
+    assert gain.shares - gain.without == pytest.approx([sum(difference) / len(without.hit)])
     # of the t distribution with 7 degrees of freedom: 1.415, 1.895, 2.998 at 10, 5 and 1 %
     levels = np.interp(t, [1.415, 1.895, 2.998], [0.1, 0.05, 0.01])
     assert gain.p_values[0] == pytest.approx(levels, abs=0.012)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.evaluation.intervals import Interval
+from harness.evaluation.intervals import UNKNOWN, Interval, false_call_rate
 from harness.evaluation.study.curves import ChanceHits, PixelCurves
 from harness.evaluation.study.limit import SetUpLimit, limit_of
 from harness.evaluation.study.record import Calibrated
@@ -120,8 +120,9 @@ def test_thresholds_set_by_one_place_or_too_high_are_warned_of(two: list[SetUpLi
     half_px = {"u_px": np.array([10.0, 10.0, 90.0, 50.0]), "v_px": np.zeros(4)}
     most_px = {"u_px": np.array([10.0, 10.0, 12.0, 50.0]), "v_px": np.zeros(4)}
     all_px = {"u_px": np.full(4, 10.0), "v_px": np.zeros(4)}
+    # the first run sets a threshold of 4.1
     for columns in (far_px, half_px):
-        assert threshold_warnings([with_runs(two[0], 7.5, **columns)]) == []
+        assert threshold_warnings([with_runs(two[0], 4.1, **columns)]) == []
     (crowd,) = threshold_warnings([with_runs(two[0], 4.4, **all_px), with_runs(two[1], 7.5)])
     assert crowd.startswith("1 frame: 4 of 4 calibration boards have their highest score on the")
     several = [with_runs(two[0], 4.1, **all_px), with_runs(two[1], 4.1, **most_px)]
@@ -270,23 +271,66 @@ def units(two: list[SetUpLimit]) -> SetUpLimit:
 def test_the_limit_of_a_new_unit_is_quoted(units: SetUpLimit, two: list[SetUpLimit]) -> None:
     assert quoted(units).value == 9.5
     assert quoted(two[0]) is two[0].a90_95
+
+
+def test_the_sentence_says_from_how_many_units_a_new_one_is_judged(units: SetUpLimit) -> None:
     sentence = limit_sentence(units)
-    assert "damage of 9.5 mm is found 90 % of the time by a new unit of the camera" in sentence
-    assert "judged from 3 units" not in sentence
-    assert "judged from 3, with 95 % confidence (a90/95), at" in sentence
+    assert sentence.startswith(
+        "1 frame: damage of 9.5 mm is found 90 % of the time by a new unit of the camera, judged"
+        " from 3, with 95 % confidence (a90/95), at"
+    )
     # the interval holds that over boards, as each board has its own unit
     assert sentence.endswith("(0.01 to 100).")
     assert study_answer([units]) == sentence
+
+
+def test_the_table_has_the_limits_of_single_units_and_of_a_new_one(
+    units: SetUpLimit, two: list[SetUpLimit]
+) -> None:
     row = LIMITS.frame([units]).iloc[0]
-    assert row["one_unit_mm"] == 8.4
-    assert row["one_unit_low_mm"] == 8.0
-    assert row["one_unit_high_mm"] == 9.1
-    assert row["new_unit_mm"] == 9.5
-    assert row["new_unit_verdict"] == "demonstrated"
+    ends_mm = (row["one_unit_low_mm"], row["one_unit_mm"], row["one_unit_high_mm"])
+    assert ends_mm == (8.0, 8.4, 9.1)
+    assert (row["new_unit_mm"], row["new_unit_verdict"]) == (9.5, "demonstrated")
     single = LIMITS.frame(two).iloc[0]
     assert single["one_unit_mm"] == two[0].a90_95.value
+
+
+def test_the_table_of_one_unit_says_so(units: SetUpLimit, two: list[SetUpLimit]) -> None:
     assert "all units (mm)" in limits_grid([units, two[1]]).heads
     assert limits_grid(two).title.startswith("One unit of the camera: ")
+
+
+@pytest.mark.parametrize(
+    ("over_boards", "stated"),
+    [
+        # 3 false calls on 1.5 m²: Garwood's interval is 0.41 to 5.8
+        (UNKNOWN, "(0.41 to 5.8)"),
+        (Interval(1.0, 3.0), "(0.41 to 5.8)"),
+        (Interval(0.1, 9.0), "(0.1 to 9)"),
+    ],
+)
+def test_false_calls_of_several_units_have_the_wider_interval(
+    units: SetUpLimit, over_boards: Interval, stated: str
+) -> None:
+    limit = replace(
+        units, false_calls=false_call_rate(3, 1.5), false_calls_interval_per_m2=over_boards
+    )
+    assert limit_sentence(limit).endswith(f", at 2 false calls per m² {stated}.")
+
+
+def test_the_limit_over_boards_is_recommended_for_a_single_unit_alone(
+    units: SetUpLimit, two: list[SetUpLimit]
+) -> None:
+    """The limit of a new unit contains what boards do."""
+    wider = replace(two[0].a90_95, value=1.2 * two[0].a90_95.value)
+    of_one = replace(two[0], over_boards=wider, design_effect=2.34)
+    of_several = replace(units, over_boards=wider, design_effect=2.34)
+    note = (
+        "the results of damages on one board are correlated (design effect 2.3): "
+        "quote the limit over boards"
+    )
+    assert note in notes_of(of_one)
+    assert note not in notes_of(of_several)
 
 
 def test_of_many_limits_depths_are_not_compared_with_diameters(two: list[SetUpLimit]) -> None:

@@ -48,6 +48,9 @@ def test_a_row_for_each_value_largest_factor_first(result):
     assert backing["stated"].iloc[0] == "distance 20 mm"
     assert set(rows["reason"]) == {"not seen", "not published", "no matter"}
     assert (rows["a90_low_mm"] < rows["a90_mm"]).all()
+    assert (rows["a90_mm"] < rows["a90_high_mm"]).all()
+    # the values of backing lie farther apart than their intervals are wide
+    assert backing["a90_low_mm"].max() > backing["a90_high_mm"].min()
 
 
 def test_the_sentence_names_the_range_and_what_it_depends_on(result):

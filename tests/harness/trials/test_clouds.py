@@ -19,9 +19,9 @@ from harness.trials.clouds import (
     mapping_of,
     pair_noise,
 )
-from harness.vocabulary.geometry import Cloud, Region
 from scenes.perspectives import ArcViews
 from tests.support.board_in_closed_form import TARGET, board_of, point_of
+from tests.support.plain_clouds import cloud_of_points
 
 ORIGIN = Origin(variant="main", frames=5, repeat=2)
 MAPPED = replace(point_of(), mapping=MappingConfig(views=2))
@@ -154,17 +154,3 @@ def test_probes_of_a_map_are_those_of_the_first_view(monkeypatch: pytest.MonkeyP
     errors = maps.probes_row(MAPPED, ORIGIN).error_tenth_um
     assert len(errors) == len(board.probes)
     assert set(errors) == {20_000}
-
-
-def cloud_of_points(points_m: np.ndarray) -> Cloud:
-    """A cloud of points (h, w, 3) without frames."""
-    shape = points_m.shape[:2]
-    return Cloud(
-        points_m=points_m,
-        reason=np.zeros(shape, np.uint8),
-        count=np.ones(shape, int),
-        variance_m2=np.full(shape, np.nan),
-        region=Region(0, shape[0], 0, shape[1]),
-        z_step_m=0.0,
-        n_frames=1,
-    )

@@ -57,11 +57,11 @@ def judgement_of(*, damaged: bool = True, threshold: float = 4.0) -> Judgement:
     zeros = np.zeros(x.shape, np.uint8)
     region = Region(0, x.shape[0], 0, x.shape[1])
     cloud = Cloud(points, zeros, zeros.astype(int), none, region, 0.0, 1, projection="parallel")
-    places = points[..., :2]
+    positions = points[..., :2]
     truth = truth_of(target, target.pose.T_camera_board)
     outlines = {
         d.id: np.flatnonzero(
-            np.linalg.norm(places - d.centre_board_m[:2], axis=-1) < d.diameter_m / 2
+            np.linalg.norm(positions - d.centre_board_m[:2], axis=-1) < d.diameter_m / 2
         )
         for d in truth
     }
@@ -74,7 +74,7 @@ def judgement_of(*, damaged: bool = True, threshold: float = 4.0) -> Judgement:
         target=target,
         truth=truth,
         outlines=outlines,
-        places_m=places,
+        places_m=positions,
         undamaged=undamaged,
         seen_depth_m={1: 0.01, 2: 0.01},
     )
@@ -208,27 +208,27 @@ def test_lines_of_sight_meet_a_sphere_where_they_should():
 
 def test_signals_are_the_highest_scores_within_the_radius():
     random = np.random.default_rng(0)
-    places = random.uniform(-0.05, 0.05, (17, 23, 2))
+    positions = random.uniform(-0.05, 0.05, (17, 23, 2))
     score = random.exponential(1.0, (17, 23))
-    places[random.random((17, 23)) < 0.1] = np.nan
+    positions[random.random((17, 23)) < 0.1] = np.nan
     score[random.random((17, 23)) < 0.1] = np.nan
     score[0, 0] = np.inf
     centres = np.vstack([random.uniform(-0.05, 0.05, (6, 2)), [[9.0, 9.0]]])
-    found = highest_within(places, score, centres, 0.015)
+    found = highest_within(positions, score, centres, 0.015)
     with np.errstate(invalid="ignore"):
-        near = [np.linalg.norm(places - centre, axis=-1) <= 0.015 for centre in centres]
-    expected = [max(score[there & np.isfinite(score)], default=np.nan) for there in near]
+        is_near = [np.linalg.norm(positions - centre, axis=-1) <= 0.015 for centre in centres]
+    expected = [max(score[there & np.isfinite(score)], default=np.nan) for there in is_near]
     np.testing.assert_array_equal(found, expected)
 
 
 def test_areas_are_those_of_numpys_gradients():
-    places = np.random.default_rng(1).uniform(-0.05, 0.05, (9, 12, 2))
-    places[4, 5] = np.nan
-    down, across = np.gradient(places, axis=(0, 1))
+    positions = np.random.default_rng(1).uniform(-0.05, 0.05, (9, 12, 2))
+    positions[4, 5] = np.nan
+    down, across = np.gradient(positions, axis=(0, 1))
     expected = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
-    np.testing.assert_allclose(pixel_areas(places), expected, rtol=1e-12)
+    np.testing.assert_allclose(pixel_areas(positions), expected, rtol=1e-12)
     assert (
-        np.isnan(pixel_areas(places)).sum() == 4
+        np.isnan(pixel_areas(positions)).sum() == 4
     )  # a central difference does not look at its own pixel
 
 

@@ -312,7 +312,7 @@ def test_broken_ones_and_clashes_are_listed_as_such_and_the_program_succeeds(
 def test_a_named_detector_shows_its_settings_and_what_is_legal(capsys):
     assert main(["detectors", "thesis", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
-    settings = {one["path"]: one for one in shown["settings"]}
+    settings = {setting["path"]: setting for setting in shown["settings"]}
     assert shown["version"] == ThesisDetector.version and shown["package"] == "tofpod"
     assert settings["surface.degree"] == {
         "path": "surface.degree",

@@ -21,7 +21,13 @@ from scenes.render.direct import (
 )
 from scenes.render.indirect import BATCHES, PATHS_A_LANE, PathWork, _gather, _sobol
 from scenes.render.range_noise import range_noise_m
-from scenes.render.view import _at_holes, _expected_noise_m, _inside_outline, _light_in_pixels
+from scenes.render.view import (
+    _around,
+    _at_holes,
+    _expected_noise_m,
+    _inside_outline,
+    _light_in_pixels,
+)
 from scenes.target.custom import (
     BoardConfig,
     DentConfig,
@@ -77,6 +83,22 @@ def target() -> Target:
         pose=PoseConfig(distance_m=0.5),
     )
     return build_target(config)
+
+
+@pytest.mark.parametrize("centre_m", [(0.0, 0.0, 0.5), (0.3, -0.2, 0.5), (-0.4, 0.4, 0.2)])
+def test_no_point_of_a_ball_is_seen_beside_the_rays_around_it(
+    centre_m: tuple[float, float, float],
+) -> None:
+    """The rays to points all over a ball of 0.1 m; they span at least half of what is kept."""
+    random = np.random.default_rng(1)
+    directions = random.standard_normal((20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points_m = np.array(centre_m) + 0.1 * directions
+    slopes = points_m[:, :2] / points_m[:, 2:]
+    assert _around(slopes[None], np.array(centre_m), 0.1).all()
+    middle = np.array(centre_m[:2]) / centre_m[2]
+    twice_as_far = middle + 2.0 * (slopes - middle)
+    assert not _around(twice_as_far[None], np.array(centre_m), 0.1).all()
 
 
 def test_pixels_of_a_hole_are_one_and_those_about_its_rim_two(target: Target) -> None:

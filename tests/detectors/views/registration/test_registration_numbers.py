@@ -26,6 +26,7 @@ from detectors.views.registration.pairing import FIT_CHI2, pair_marks
 from detectors.views.registration.settings import CpdRegistration
 from detectors.views.view import PreparedView, View
 from harness.vocabulary.geometry import Cloud, Lens, transform_points
+from tests.support.plain_clouds import cloud_of_points
 
 PITCH_M = 2e-3
 
@@ -279,16 +280,9 @@ def gridded(noise_m: float, tilt: float, lens: Lens, step_m: float = 0.0) -> Pre
     slopes = lens.region_slopes(lens.whole)
     z_m = 0.8 / (1.0 - tilt * slopes[..., 0])
     z_m = z_m + noise_m * np.random.default_rng(8).standard_normal(z_m.shape)
-    cloud = Cloud(
-        points_m=np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1),
-        reason=np.zeros(z_m.shape, np.uint8),
-        count=np.full(z_m.shape, 9),
-        variance_m2=np.full(z_m.shape, np.nan),
-        region=lens.whole,
-        z_step_m=step_m,
-        n_frames=9,
-        lens=lens,
-    )
+    points_m = np.concatenate([slopes * z_m[..., None], z_m[..., None]], axis=-1)
+    count = np.full(z_m.shape, 9)
+    cloud = cloud_of_points(points_m, count=count, n_frames=9, z_step_m=step_m, lens=lens)
     return PreparedView(View("v", cloud, None), cloud.valid, MarkSet((), np.zeros(0, int)))
 
 
@@ -307,6 +301,19 @@ def test_the_sampling_of_a_grid_is_that_of_its_coarser_axis(tilt: float) -> None
         np.testing.assert_allclose(sampling.centre_m, points.mean(axis=0))
         if tilt == 0.0:
             assert sampling.noise_m == pytest.approx(2e-4, rel=0.06)
+
+
+def test_the_pitch_of_a_grid_of_which_no_neighbours_are_known_is_that_of_its_points() -> None:
+    """Every second pixel of both axes is known: still enough, six pixels apart, for the noise."""
+    lens = Lens(121, 101, 400.0, 400.0, 60.0, 50.0)
+    view = gridded(2e-4, 0.0, lens)
+    is_known = np.zeros((101, 121), bool)
+    is_known[::2, ::2] = True
+    sparse_cloud = replace(view.view.cloud, reason=np.where(is_known, 0, 1).astype(np.uint8))
+    sparse = replace(view, view=replace(view.view, cloud=sparse_cloud), inside=is_known)
+    sampling = registered.sampling_of(sparse)
+    assert sampling.pitch_m == pytest.approx(2 * 0.8 / 400.0, rel=0.02)
+    assert sampling.noise_m == pytest.approx(2e-4, rel=0.06)
 
 
 def test_the_noise_is_no_less_than_rounding_leaves_in_the_mean() -> None:

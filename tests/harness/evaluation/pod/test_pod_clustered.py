@@ -13,7 +13,7 @@ from harness.evaluation.pod import clustered
 from harness.evaluation.pod.averaged import ModelAverage, log_weights
 from harness.evaluation.pod.clustered import ClusterAverage, _curves_of, _level
 from harness.evaluation.pod.curve import LINKS, link_cdf, link_ppf
-from harness.evaluation.pod.hit_miss import choose_model, near_models
+from harness.evaluation.pod.hit_miss import choose_model, fit_hit_miss, near_models
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,17 @@ class Curve:
 
 
 def study(
-    shift_mm: float, boards: int = 12, holes: int = 8, seed: int = 1
+    shift_mm: float, boards: int = 12, holes: int = 8, seed: int = 1, link: str = ""
 ) -> tuple[ModelAverage, np.ndarray]:
-    """The average of simulated hits on boards whose a50 differ, and the board of each."""
+    """The average of simulated hits on boards whose a50 differ, or the one model with a ``link``,
+    and the board of each."""
     random = np.random.default_rng(seed)
     board = np.repeat(np.arange(boards), holes)
     size_mm = random.permutation(np.linspace(1.0, 14.0, boards * holes))
     middle_mm = 6.0 + shift_mm * random.standard_normal(boards)[board]
     hit = random.random(len(board)) < link_cdf("logit", (size_mm - middle_mm) / 0.8)
+    if link:
+        return ModelAverage((fit_hit_miss(size_mm, hit, link=link),)), board
     return ModelAverage(near_models(choose_model(size_mm, hit))), board
 
 
@@ -72,9 +75,10 @@ def log_likelihood_of(average: ModelAverage, board: np.ndarray, curve: Curve) ->
     return total
 
 
-def test_the_likelihood_is_the_product_over_clusters_of_means_over_shifts() -> None:
+@pytest.mark.parametrize("link", LINKS)
+def test_the_likelihood_is_the_product_over_clusters_of_means_over_shifts(link: str) -> None:
     """The weights of the likeliest curve of each share differ as their likelihoods do."""
-    average, board = study(1.0)
+    average, board = study(1.0, link=link)
     fit = average.fits[0]
     low, high = link_ppf(fit.curve.link, np.array([0.1, 0.9]))
     curves = _curves_of(average, 0, board, 1.0)

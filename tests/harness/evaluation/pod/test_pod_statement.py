@@ -233,16 +233,23 @@ def test_models_that_differ_are_warned_of() -> None:
     assert doubts(np.inf, 1.9)[0].endswith("to not demonstrated")
 
 
-def test_small_studies_and_extrapolated_bounds_are_noted() -> None:
+def test_small_studies_are_noted() -> None:
     small_study = state_hits(hits_of(59, 5), tested=False)
     assert small_study.notes[0] == "59 independent targets; MIL-HDBK-1823A asks for at least 60"
     assert state_hits(hits_of(60, 5), tested=False).notes == ()
-    read = hits_of(60, 5)
-    small = read.size < 5.0
+
+
+def test_a_bound_beyond_all_sizes_is_noted() -> None:
+    """Without sizes above 6.5 mm, the curve alone says where 90 % are found."""
+    read = hits_of(100, 5)
+    small = read.size < 6.5
     beyond = state_hits(inspections(read.size[small], read.response[small]), tested=False)
-    if beyond.bound.demonstrated:
-        assert beyond.bound.value > read.size[small].max()
-        assert "lies beyond the largest size inspected" in beyond.notes[-1]
+    assert beyond.bound.demonstrated
+    assert beyond.bound.value > 6.5
+    (note,) = beyond.notes
+    assert (
+        note == f"a90/95 = {beyond.bound.value:.3g} lies beyond the largest size inspected, 6.449"
+    )
 
 
 # signals

@@ -52,7 +52,8 @@ def curves_between(a50: tuple[float, float], a90: tuple[float, float]) -> Weight
     """Logistic curves through pairs of a50 and a90, with normal weights of which 95 % lie in the
     intervals."""
     steps = np.linspace(-3.0, 3.0, 13)
-    first, second = (grid.ravel() for grid in np.meshgrid(steps, steps))
+    pairs = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
+    first, second = pairs
     weight = np.exp(-0.5 * (first**2 + second**2))
     a50_mm = np.mean(a50) + first * np.ptp(a50) / 3.92
     a90_mm = np.mean(a90) + second * np.ptp(a90) / 3.92

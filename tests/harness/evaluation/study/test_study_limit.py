@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.evaluation.intervals import percentiles
+from harness.evaluation.intervals import Interval, percentiles
 from harness.evaluation.pod.averaged import ModelAverage
 from harness.evaluation.pod.clustered import ClusterAverage
 from harness.evaluation.pod.curve import CELLS, LINKS, PodCurve
@@ -22,7 +22,7 @@ from harness.evaluation.study.boards import (
     weights_in_blocks,
 )
 from harness.evaluation.study.limit import ALL_FOUND, limit_of
-from harness.evaluation.study.record import Inspected, SetUpRecord
+from harness.evaluation.study.record import Inspected, SetUpRecord, Unflawed
 from harness.tables.limits import limit_sentence
 from tests.support.synthetic_study import SetUp, Study, study_record
 
@@ -265,6 +265,39 @@ class TestFalseCalls:
         over = limit.false_calls_interval_per_m2
         poisson = limit.false_calls.interval_per_m2
         assert over.high - over.low > 1.5 * (poisson.high - poisson.low)
+
+    def test_the_rate_of_drawn_boards_is_over_their_own_area(self, small):
+        """A call on 1 m² and none on 3 m²: draws have a rate of 1, 1/4 or 0 per m²."""
+        unflawed = dataclasses.replace(
+            small.unflawed,
+            board=np.array([0, 1]),
+            repeat=np.array([0, 0]),
+            calls=np.array([1, 0]),
+            area_m2=np.array([1.0, 3.0]),
+        )
+        limit = limit_of(dataclasses.replace(small, unflawed=unflawed))
+        assert limit.false_calls.rate_per_m2 == 1 / 4
+        assert limit.false_calls_interval_per_m2 == Interval(0.0, 1.0)
+
+    def test_calls_beside_damage_are_those_of_damaged_boards(self, small):
+        beside = Unflawed(
+            board=np.arange(4),
+            repeat=np.zeros(4, int),
+            calls=np.array([0, 5, 0, 2]),
+            area_m2=np.full(4, 0.5),
+        )
+        limit = limit_of(dataclasses.replace(small, beside=beside))
+        assert (limit.beside.calls, limit.beside.rate_per_m2) == (7, 3.5)
+        assert limit.false_calls.calls == small.unflawed.calls.sum()
+
+
+def test_units_that_found_the_same_of_what_is_apart_widen_nothing(repeated):
+    """The likelihood of a step says nothing of how much units differ."""
+    apart = with_hits(repeated, repeated.inspected.size_mm > 6.0)
+    of_one = limit_of(apart, draws=20)
+    of_three = limit_of(dataclasses.replace(apart, units=3), draws=20)
+    assert of_three.statement.fits[0].method == "Firth"
+    assert of_three.a90_interval_mm == of_one.a90_interval_mm
 
 
 def row_weights(

@@ -7,12 +7,19 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import special, stats
 
 from harness.evaluation.pod.hit_miss import fit_hit_miss
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import SetUpRecord, ThresholdError
-from harness.evaluation.study.signals import SATURATED, SignalSizes, sandwich, sizes_from_signals
+from harness.evaluation.study.signals import (
+    SATURATED,
+    SignalSizes,
+    _fit,
+    _line,
+    sandwich,
+    sizes_from_signals,
+)
 from harness.programs.audit.studies import StudyCase, drawn_threshold, recorded
 from harness.programs.gate.paired import signal_limit_change
 from harness.vocabulary.seeds import random_stream
@@ -116,6 +123,35 @@ def test_boards_that_differ_widen_the_interval_as_a_jackknife_does():
     assert line.variance(0.5) == pytest.approx(of_boards + line.of_threshold**2)
     of_damages = line.fit.curve.covariance
     assert of_boards > 1.3 * of_damages[0, 0]
+
+
+def test_boards_that_cancel_leave_the_variance_of_damages():
+    """Boards' influences may be small by chance; damages are no more certain for it."""
+    record = studied(2)
+    (line, *_) = sizes(record).lines
+    cancelled = dataclasses.replace(line, influence=1e-3 * line.influence)
+    expected = line.fit.curve.covariance[0, 0] + line.of_threshold**2
+    assert cancelled.variance(0.5) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("log_size", [False, True])
+def test_sizes_have_students_quantiles_with_a_degree_for_each_board_but_one(log_size):
+    line = _line(studied(2), _fit(studied(2), log_size=log_size, log_signal=False))
+    curve = line.fit.curve
+    deviation = np.sqrt(line.variance(0.9))
+    middle = curve.mu + NORMAL_90 * curve.sigma
+    shares = (np.arange(400) + 0.5) / 400
+    expected = stats.t.ppf(shares, CASE.boards - 1, loc=middle, scale=deviation)
+    assert line.quantiles(0.9) == pytest.approx(np.exp(expected) if log_size else expected)
+
+
+def test_on_an_axis_of_logarithms_the_thresholds_error_is_relative():
+    error = ThresholdError(error=0.4, low_per_m2=0.5, high_per_m2=2.0, method="test")
+    record = dataclasses.replace(studied(3), threshold_error=error)
+    plain = _line(record, _fit(record, log_size=False, log_signal=False))
+    logarithmic = _line(record, _fit(record, log_size=False, log_signal=True))
+    assert plain.error == 0.4
+    assert logarithmic.error == pytest.approx(0.4 / record.threshold)
 
 
 def test_the_thresholds_error_is_error_over_slope():

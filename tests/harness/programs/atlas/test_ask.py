@@ -205,17 +205,17 @@ def test_an_own_camera_is_answered_by_the_camera_of_its_numbers(
 ):
     """The file of a Femto Bolt, copied, has the numbers of the stored Azure Kinect; with another
     gain it has not."""
-    own = tmp_path / "mine.yaml"
-    own.write_text("like: azure_kinect_nfov\nname: mine\ntitle: Mine\n")
-    question = ["--distance", "1m", "--camera", str(own)]
+    own_file = tmp_path / "mine.yaml"
+    own_file.write_text("like: azure_kinect_nfov\nname: mine\ntitle: Mine\n")
+    question = ["--distance", "1m", "--camera", str(own_file)]
     assert main(question) == 0
     assert "Azure Kinect DK, NFOV unbinned" in capsys.readouterr().out
     gain = "photons:\n  signal_electrons: {value: 99.0, tag: U, source: mine}\n"
-    own.write_text(own.read_text() + gain)
-    own = own.rename(tmp_path / "other.yaml")
-    own.write_text(own.read_text().replace("name: mine", "name: other"))
-    assert main(["--distance", "1m", "--camera", str(own)]) == 2
-    assert f"compute its limits: tofpod atlas {own}" in capsys.readouterr().err
+    own_file.write_text(own_file.read_text() + gain)
+    own_file = own_file.rename(tmp_path / "other.yaml")
+    own_file.write_text(own_file.read_text().replace("name: mine", "name: other"))
+    assert main(["--distance", "1m", "--camera", str(own_file)]) == 2
+    assert f"compute its limits: tofpod atlas {own_file}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

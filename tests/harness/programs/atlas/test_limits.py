@@ -99,31 +99,35 @@ def test_nothing_is_extrapolated(conditions: Conditions, message: str):
 
 def test_neither_is_the_noise_over_the_depth():
     """A law of little noise says nothing of much."""
-    whole = surface("blind")
-    lowest, highest = whole.law.ranges["x"]
-    ranges = {**whole.law.ranges, "x": (lowest, highest - 2.0)}
+    blind_holes = surface("blind")
+    lowest, highest = blind_holes.law.ranges["x"]
+    ranges = {**blind_holes.law.ranges, "x": (lowest, highest - 2.0)}
     with pytest.raises(Outside, match="of the depth: the atlas has"):
-        replace(whole, law=replace(whole.law, ranges=ranges)).at(Conditions(2.6, 0.1, 1, 1.0))
+        replace(blind_holes, law=replace(blind_holes.law, ranges=ranges)).at(
+            Conditions(2.6, 0.1, 1, 1.0)
+        )
 
 
 def test_beyond_a_set_up_that_failed_nothing_is_known():
     """Farther, darker or with fewer frames than boards that the camera did not see."""
-    whole = replace(surface(), failed=(FailedSetUp(1.5, 0.4, 5),))
+    with_failed = replace(surface(), failed=(FailedSetUp(1.5, 0.4, 5),))
     for hard in (Conditions(1.5, 0.4, 5, 20.0), Conditions(2.0, 0.2, 1, 20.0)):
         with pytest.raises(Outside, match=r"at 1\.5 m, albedo 0\.4, frames 5, which is no harder"):
-            whole.at(hard)
+            with_failed.at(hard)
     for easier in (
         Conditions(1.4, 0.4, 5, 20.0),
         Conditions(1.5, 0.5, 5, 20.0),
         Conditions(1.5, 0.4, 6, 20.0),
     ):
-        assert len(whole.at(easier).sizes_mm)
+        assert len(with_failed.at(easier).sizes_mm)
 
 
 def test_a_law_of_unknown_error_answers_nothing():
-    whole = surface()
+    known_error = surface()
     with pytest.raises(Outside, match="of 288 such damages were found in all set-ups, too few"):
-        replace(whole, law=replace(whole.law, error=math.nan)).at(Conditions(0.5, 0.3, 10, 20.0))
+        replace(known_error, law=replace(known_error.law, error=math.nan)).at(
+            Conditions(0.5, 0.3, 10, 20.0)
+        )
 
 
 def sites(stream: np.random.Generator, offsets: np.ndarray) -> Sites:
@@ -152,8 +156,8 @@ def sites(stream: np.random.Generator, offsets: np.ndarray) -> Sites:
 def test_an_error_is_never_below_what_its_departures_can_tell():
     """Departures all but equal to the law leave their own chance, by the scatter of a variance."""
     law, departures = fitted(sites(np.random.default_rng(5), np.zeros(12)), {})
-    between = np.array([one.deviation for one in departures[1:-1]])
-    excess = np.array([one.log_signal for one in departures[1:-1]]) ** 2 - between**2
+    between = np.array([departure.deviation for departure in departures[1:-1]])
+    excess = np.array([departure.log_signal for departure in departures[1:-1]]) ** 2 - between**2
     least = (between**2).mean() * np.sqrt(2 / len(between))
     assert excess.mean() < 0
     assert law.error == pytest.approx(np.sqrt(least))
@@ -167,41 +171,41 @@ def test_the_error_is_that_of_distances_left_out():
     offsets = np.tile([-0.3, 0.3], 8)
     uneven, departures = fitted(sites(stream, offsets), {})
     assert uneven.error == pytest.approx(0.3, rel=0.25) and uneven.degrees == 14
-    departed = [one.log_signal for one in departures]
+    departed = [departure.log_signal for departure in departures]
     assert departed == pytest.approx(offsets, abs=0.2)
-    assert sum(one.expected for one in departures) == pytest.approx(
-        sum(one.hits for one in departures), rel=0.05
+    assert sum(departure.expected for departure in departures) == pytest.approx(
+        sum(departure.hits for departure in departures), rel=0.05
     )
 
 
 def test_the_gradient_of_the_fit():
     """Against differences of the loss, with misses, hits, and hits above what counts."""
-    own = sites(np.random.default_rng(5), np.zeros(4))
+    damages = sites(np.random.default_rng(5), np.zeros(4))
     ends = (0.0, 2.5)
-    design = fitting._design(own, ends)
+    design = fitting._design(damages, ends)
     values = np.append(fitting.PRIOR_MEANS + 0.1, -1.0)
-    assert np.any(own.log_signal > np.log(fitting.SATURATED)) and not own.is_found.all()
-    gradient = fitting._loss(values, design, own)[1]
+    assert np.any(damages.log_signal > np.log(fitting.SATURATED)) and not damages.is_found.all()
+    gradient = fitting._loss(values, design, damages)[1]
     for index, step in enumerate(1e-5 * np.eye(len(values))):
-        above = fitting._loss(values + step, design, own)[0]
-        below = fitting._loss(values - step, design, own)[0]
+        above = fitting._loss(values + step, design, damages)[0]
+        below = fitting._loss(values - step, design, damages)[0]
         assert gradient[index] == pytest.approx((above - below) / 2e-5, rel=1e-5, abs=1e-5)
 
 
 def test_the_density_of_a_signal():
     """A miss is below its own threshold, a hit above it; in between, a signal is itself."""
-    own = sites(np.random.default_rng(5), np.zeros(1)).chosen(np.arange(3))
-    own = replace(
-        own,
+    damages = sites(np.random.default_rng(5), np.zeros(1)).chosen(np.arange(3))
+    damages = replace(
+        damages,
         log_signal=np.array([0.2, 0.5, 9.0]),
         log_threshold=np.array([0.3, 0.3, 0.3]),
         is_found=np.array([False, True, True]),
     )
-    density, _, _ = fitting._log_densities(np.full(3, 0.4), 0.5, own)
-    most = np.log(fitting.SATURATED)
+    density, _, _ = fitting._log_densities(np.full(3, 0.4), 0.5, damages)
+    log_saturated = np.log(fitting.SATURATED)
     assert density[0] == pytest.approx(np.log(special.ndtr((0.3 - 0.4) / 0.5)))
     assert density[1] == pytest.approx(np.log(np.exp(-0.5 * 0.2**2) / np.sqrt(2 * np.pi) / 0.5))
-    assert density[2] == pytest.approx(np.log(special.ndtr((0.4 - most) / 0.5)))
+    assert density[2] == pytest.approx(np.log(special.ndtr((0.4 - log_saturated) / 0.5)))
 
 
 def answer_of(middle: list[float], half: float, *, grows: bool = True) -> Answer:
@@ -232,8 +236,8 @@ def test_a_limit_and_its_verdicts(
     answer = answer_of(middle, 0.5)
     ends = (answer.low_mm, answer.a90_mm, answer.high_mm)
     assert ends == pytest.approx(limit, rel=0.02, nan_ok=True)
-    said = [answer.verdict(size_mm) for size_mm in (0.5, 1.5, 2.0, 5.0, 9.0)]
-    assert said == verdicts.split()
+    stated_verdicts = [answer.verdict(size_mm) for size_mm in (0.5, 1.5, 2.0, 5.0, 9.0)]
+    assert stated_verdicts == verdicts.split()
 
 
 def test_what_is_much_smaller_than_inspected_is_not_found():

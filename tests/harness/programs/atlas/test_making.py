@@ -86,7 +86,11 @@ def test_a_shard_is_made_once_and_again_only_after_a_stop(
             raise KeyboardInterrupt
         if distance_m > 2.5:
             return None, "the camera sees nothing of the board"
-        part = next(one for one in parts_of("kinect_v2", near) if one.distance_m == distance_m)
+        part = next(
+            candidate
+            for candidate in parts_of("kinect_v2", near)
+            if candidate.distance_m == distance_m
+        )
         return damages_of("sharp", part, stream), ""
 
     near = noise(FINEST, 0.525)

@@ -10,13 +10,17 @@ from scipy import ndimage
 
 from detectors.surfaces.expected import Triangles, normals_of
 from harness.programs.camera.gauge_range import (
+    _fitted,
+    _start,
     averaged_ranges_m,
     blur_of,
     edge_blur,
     seen_ranges_m,
+    triangles_of,
     variance_of,
 )
 from harness.stills.spheres import RangeImage, range_image
+from tests.support.gauge_scene import LENS, exact_gauge, pose
 
 DRAWS = 12
 NOISE_M = 0.3e-3
@@ -55,17 +59,17 @@ def test_blur_is_found_without_bias_and_held_by_its_intervals(blur_px: float):
     assert exact is not None
     assert variance_of(exact.blur_px) == pytest.approx(variance_of(blur_px), abs=3e-3)
     found = []
-    held = 0
+    covered = 0
     for seed in range(DRAWS):
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(inverse.shape)
         noisy = replace(sharp, range_m=1 / inverse + noise_m)
         blur = edge_blur(noisy, sharp.range_m, displaced_px=0.0)
         assert blur is not None
         found.append(variance_of(blur.blur_px))
-        held += blur.interval.low <= blur_px <= blur.interval.high
+        covered += blur.interval.low <= blur_px <= blur.interval.high
         wide = variance_of(blur.interval.high) - variance_of(blur.blur_px)
         assert wide < 0.1 + 0.1 * blur_px
-    assert held >= DRAWS - 2
+    assert covered >= DRAWS - 2
     if blur_px >= 0.6:
         assert np.mean(found) == pytest.approx(variance_of(blur_px), abs=0.01)
 
@@ -104,3 +108,25 @@ def test_a_pixel_shows_the_mean_of_its_area():
     assert seen_m[5:15, 9] == pytest.approx(0.500, abs=2e-5)
     assert seen_m[5:15, 10] == pytest.approx(0.510 - 0.25 * 0.010, abs=2e-4)
     assert seen_m[5:15, 11] == pytest.approx(0.510, abs=2e-5)
+
+
+def test_scale_and_bias_of_a_noisy_image_with_the_gauges_own_uncertainty() -> None:
+    """Ranges are 1 % too long and 2 mm too far. An uncertainty of the gauge's scale of 0.2 % adds
+    to the error of the range's scale, which it multiplies."""
+    exact = exact_gauge()
+    rays = range_image(np.ones((LENS.height, LENS.width, 3)), LENS.region_slopes(LENS.whole))
+    true_m = seen_ranges_m(triangles_of(exact), rays.rays, pose())
+    noise_m = NOISE_M * np.random.default_rng(1).standard_normal(true_m.shape)
+    image = replace(rays, range_m=1.01 * true_m + 2e-3 + noise_m)
+    fits = []
+    for scale in (0.0, 2e-3):
+        uncertainty = exact.uncertainty.model_copy(update={"scale": scale})
+        gauge = exact.model_copy(update={"uncertainty": uncertainty})
+        fits.append(_fitted(image, gauge, _start(pose())))
+    sharp, rough = fits
+    assert abs(sharp.scale - 1.01) < 3 * sharp.sigmas[0] < 1e-3
+    assert abs(sharp.bias_m - 2e-3) < 3 * sharp.sigmas[1] < 1e-3
+    added = np.sqrt(rough.sigmas[0] ** 2 - sharp.sigmas[0] ** 2)
+    assert added == pytest.approx(1.01 * 2e-3, rel=1e-3)
+    assert rough.sigmas[1] == pytest.approx(sharp.sigmas[1])
+    assert rough.scale == pytest.approx(sharp.scale)

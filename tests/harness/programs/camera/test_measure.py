@@ -460,14 +460,14 @@ def test_an_edge_is_narrow_and_high(apart_px: int, step_m: float, counts: bool) 
 
 
 def test_an_edge_has_at_least_thirty_lines() -> None:
-    for lines, known in ((30, True), (29, False)):
+    for lines, is_known in ((30, True), (29, False)):
         z_m = np.ones((4, lines, 40))
         z_m[:, :, 20:] = 1.5
         in_front = np.broadcast_to(np.arange(40) < 20, (lines, 40))
         surfaces = ((Plane(1.0), in_front), (Plane(1.5), ~in_front))
         slopes = np.zeros((lines, 40, 2))
         edge = measure.edge_of([still(z_m, planes=surfaces, slopes=slopes)])
-        assert (edge is not None) == known
+        assert (edge is not None) == is_known
     # a pixel more than two tolerances off its surface belongs to the edge
     z_m = np.ones((4, 30, 40))
     z_m[:, :, 19] = 1.017
@@ -546,9 +546,9 @@ def test_doubts_are_told_where_there_are_some(
         "no amplitude is recorded: noise and dropouts of darker surfaces are unknown"
     )
     assert without_amplitude in doubts
-    further = [doubt for doubt in doubts if doubt != without_amplitude]
-    assert len(further) == len(words)
-    for doubt, word in zip(further, words, strict=True):
+    other_doubts = [doubt for doubt in doubts if doubt != without_amplitude]
+    assert len(other_doubts) == len(words)
+    for doubt, word in zip(other_doubts, words, strict=True):
         assert word in doubt
 
 

@@ -471,11 +471,11 @@ def test_weaker_signals_and_a_higher_threshold_are_worse_though_a90_is_not():
 def test_the_luck_of_both_calibrations_is_in_the_test_of_signals():
     """Scores of 48 runs scatter by 7 %, so a threshold that was calibrated anew is known to some
     per cent only."""
-    one = small(boards=20)
+    one_study = small(boards=20)
     scores = 5.0 * np.exp(0.07 * np.random.default_rng(1).standard_normal(48))
     runs = Calibrated(np.arange(48), np.zeros(48, int), scores, np.zeros(48), np.zeros(48))
     threshold = float(np.sort(scores)[-9])
-    first = first_set_up(one, calibrated=runs, threshold=threshold)
+    first = first_set_up(one_study, calibrated=runs, threshold=threshold)
     again = replace(runs, score=1.13 * runs.score)
     lucky = weaker(first, 1.0, 1.13, threshold=1.13 * threshold, calibrated=again)
     assert only_row(first, weaker(first, 1 / 1.13)).signal.less_p < 1e-6

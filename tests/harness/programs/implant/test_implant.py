@@ -89,9 +89,9 @@ def test_implanted_damage_is_what_the_camera_would_have_seen(
     T = target.pose.T_camera_board
     position = (T @ [12.0 * MM, -6.0 * MM, 0.0, 1.0])[:3]
     config, same = unit_config(CAMERA, camera.nominal_lens)
-    (one,) = target.damages
+    (placed,) = target.damages
     part = PartFace(T, np.full(2, -50.0 * MM), np.full(2, 50.0 * MM))
-    alone = tangent_board(target, one, part, position, T[:3, 2])
+    alone = tangent_board(target, placed, part, position, T[:3, 2])
     implant = implant_of(config, same, camera.nominal_lens, alone, 48, 3, tmp_path)
     assert same
     np.testing.assert_allclose(alone.pose.T_camera_board[:3, 2], T[:3, 2], atol=1e-9)
@@ -160,10 +160,10 @@ def test_a_rim_that_is_seen_more_steeply_is_told(radius_m: float | None, said: s
     assert (middle_deg > 25) == (radius_m is not None)
     # a slot's own outline is its truth, and what lies within a margin of it is no intact surface
     (site, *_) = [
-        one
+        placed
         for n in range(9)
-        for one in [damages_placed(scan, family, CAMERA, "damaged", n)]
-        if one.damages
+        for placed in [damages_placed(scan, family, CAMERA, "damaged", n)]
+        if placed.damages
     ]
     reference = scan.known(scan.whole, site, damaged=True)
     for damage in reference.truth:

@@ -89,8 +89,9 @@ def test_places_lie_on_the_rays_of_their_pixels(scan: Scan) -> None:
     v = np.array([5.5, 5.5, 53.5, 53.5])
     corner_rays = np.stack([(u - 39.5) / 200.0, (v - 29.5) / 210.0, np.ones(4)], axis=-1)
     corners = corner_rays * WALL.z_along_m(corner_rays[:, :2])[:, None]
-    first, second = np.diff(corners[[0, 2]], axis=0)[0], np.diff(corners[[1, 3]], axis=0)[0]
-    area_m2 = np.linalg.norm(np.cross(first, second)) / 2
+    first_diagonal = corners[2] - corners[0]
+    second_diagonal = corners[3] - corners[1]
+    area_m2 = np.linalg.norm(np.cross(first_diagonal, second_diagonal)) / 2
     assert scan.area_m2 == pytest.approx(area_m2, rel=1e-3)
     assert scan.pitch_m == pytest.approx(np.sqrt(scan.area_m2 / 3000))
 

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
+from detectors.interface import Evidence
 from harness import sweep
 from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import read_record
 from harness.programs.inspections import design_statistics as plan
 from harness.programs.inspections import gauge, pod
-from harness.programs.inspections.gauge_board import Gauge, read_gauge
+from harness.programs.inspections.gauge_board import Gauge, read_gauge, seen_on
 from harness.programs.inspections.gauge_page import (
     MARGIN_MM,
     PAPER_MM,
@@ -25,6 +26,8 @@ from harness.programs.inspections.gauge_page import (
     template_pdf,
     tiles_of,
 )
+from harness.report.findings import Judged
+from harness.vocabulary.errors import UserError
 from harness.vocabulary.geometry import (
     MM,
     Lens,
@@ -39,6 +42,7 @@ from scenes.sensor.camera import camera_of
 from scenes.sensor.common.config import CameraConfig
 from scenes.sensor.source import SimulatedUnit
 from scenes.target import custom
+from tests.support.plain_clouds import cloud_of_points
 
 CAMERA = "azure_kinect_nfov"
 LENS = Lens(width=640, height=480, fx=700.0, fy=700.0, cx=320.3, cy=239.2)
@@ -54,6 +58,18 @@ def gauge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("gauge") / "out"
     assert gauge.main([*GIVEN, "--out", str(out)]) == 0
     return out
+
+
+@pytest.mark.parametrize(("largest_mm", "is_told"), [(10, True), (11, False)])
+def test_sizes_that_would_not_show_a_larger_a90_are_told(
+    largest_mm: int, is_told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A guess of 7 mm may be too small by a factor of 1.5."""
+    sizes = ["--diameters", f"2:{largest_mm}", "--a50", "5", "--a90", "7", "--targets", "10"]
+    assert gauge.main([*sizes, "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert ("warning: " in printed) == is_told
+    assert ("the true a90 is 10.5 mm, which no hole of 2 to 10 mm would show" in printed) == is_told
 
 
 def test_the_truth_holds_what_was_designed(gauge_folder: Path):
@@ -145,19 +161,23 @@ def picture(truth: Gauge, place_mm: np.ndarray, hidden: tuple[int, ...] = ()) ->
     return rgb
 
 
+def face_before_camera() -> tuple[np.ndarray, np.ndarray]:
+    """The face of a board in front of the lens: z (h, w), and the places (h, w, 2) on it in mm."""
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(6.0, -9.0, 3.0)
+    T[:3, 3] = 0.01, -0.005, 0.42
+    rays = rays_of(LENS.region_slopes(LENS.whole))
+    normal = T[:3, 2]
+    centre = T[:3, 3]
+    z_m = (centre @ normal) / (rays @ normal)
+    return z_m, transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
+
+
 def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     """The drilled board as a camera without a model would see it: holes above a size are steps,
     with noise."""
     (board,) = truth.boards
-    T = np.eye(4)
-    T[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ rotation_xyz_deg(6.0, -9.0, 3.0)
-    T[:3, 3] = 0.01, -0.005, 0.42
-    slopes = LENS.region_slopes(LENS.whole)
-    rays = rays_of(slopes)
-    normal = T[:3, 2]
-    centre = T[:3, 3]
-    z_m = (centre @ normal) / (rays @ normal)
-    board_xy_mm = transform_points(invert(T), rays * z_m[..., None])[..., :2] / MM
+    z_m, board_xy_mm = face_before_camera()
     on_board = (np.abs(board_xy_mm) < np.array([board.width_mm, board.height_mm]) / 2).all(axis=-1)
     z_m = np.where(on_board, z_m, z_m + 0.3)
     for hole in board.holes:
@@ -181,6 +201,33 @@ def captured(folder: Path, truth: Gauge, hidden: tuple[int, ...] = ()) -> Path:
     }
     (folder / "intrinsic.json").write_text(json.dumps(sizes))
     return folder
+
+
+@pytest.mark.parametrize(
+    ("shown_in", "is_read"), [("colour", True), ("infrared", False), ("infrared alone", True)]
+)
+def test_marks_are_read_in_colour_and_without_it_in_infrared(
+    gauge_folder: Path, shown_in: str, is_read: bool
+) -> None:
+    truth = read_gauge(gauge_folder / "gauge.json")
+    z_m, place_mm = face_before_camera()
+    marks = picture(truth, place_mm)
+    blank = np.full_like(marks, 200)
+    infrared = {"colour": blank, "infrared": marks, "infrared alone": marks}[shown_in][..., 0]
+    rgb = {"colour": marks, "infrared": blank, "infrared alone": None}[shown_in]
+    rays = rays_of(LENS.region_slopes(LENS.whole))
+    cloud = cloud_of_points(
+        rays * z_m[..., None], lens=LENS, rgb=rgb, amplitude=40.0 * infrared.astype(float)
+    )
+    flat = np.zeros(z_m.shape)
+    judged = Judged(cloud, Evidence(flat, flat, z_m, 1e-3), (), ())
+    if is_read:
+        seen = seen_on(truth, judged, "plane 1", 5.0)
+        assert "4 marks" in seen.notes[0]
+        assert [row.found for row in seen.rows] == ["miss"] * 24
+    else:
+        with pytest.raises(UserError, match="no board is recognised"):
+            seen_on(truth, judged, "plane 1", 5.0)
 
 
 @pytest.mark.usefixtures("unsaved")

@@ -37,20 +37,22 @@ def test_the_body_s_volume_is_that_of_its_elements(solid: trimesh.Trimesh):
     """Plate, steps, posts up to their spheres, and truncated spheres, less pockets, grooves and
     marks: nothing overlaps by mistake. Facets take 0.07 % of circles and 0.2 % of spheres."""
     truth = designed(is_cut=False)
-    whole = truth.width_mm * truth.height_mm * truth.thickness_mm
-    whole += sum(step.side_mm**2 * step.height_mm for step in truth.steps)
+    volume_mm3 = truth.width_mm * truth.height_mm * truth.thickness_mm
+    volume_mm3 += sum(step.side_mm**2 * step.height_mm for step in truth.steps)
     post = truth.post_mm / 2
     for ball in truth.spheres:
         radius = ball.diameter_mm / 2
         cap = radius - np.sqrt(radius**2 - post**2)
-        whole += 4 / 3 * np.pi * radius**3 + np.pi * post**2 * (ball.z_mm - radius + cap)
-        whole -= np.pi * cap**2 * (radius - cap / 3)
-    whole -= sum(np.pi / 4 * one.diameter_mm**2 * one.depth_mm for one in truth.pockets)
-    for one in truth.grooves:
-        area = np.pi / 4 * one.width_mm**2 + one.width_mm * (one.length_mm - one.width_mm)
-        whole -= area * one.depth_mm
-    whole -= inlay_of(truth).volume
-    assert solid.volume == pytest.approx(whole, rel=8e-4)
+        volume_mm3 += 4 / 3 * np.pi * radius**3 + np.pi * post**2 * (ball.z_mm - radius + cap)
+        volume_mm3 -= np.pi * cap**2 * (radius - cap / 3)
+    for pocket in truth.pockets:
+        volume_mm3 -= np.pi / 4 * pocket.diameter_mm**2 * pocket.depth_mm
+    for groove in truth.grooves:
+        straight_mm = groove.length_mm - groove.width_mm
+        area_mm2 = np.pi / 4 * groove.width_mm**2 + groove.width_mm * straight_mm
+        volume_mm3 -= area_mm2 * groove.depth_mm
+    volume_mm3 -= inlay_of(truth).volume
+    assert solid.volume == pytest.approx(volume_mm3, rel=8e-4)
 
 
 def test_the_3mf_has_the_body_and_its_black_marks(solid: trimesh.Trimesh):
@@ -61,17 +63,20 @@ def test_the_3mf_has_the_body_and_its_black_marks(solid: trimesh.Trimesh):
     assert model.attrib["unit"] == "millimeter"
     counts = []
     for part in model.iter(f"{space}mesh"):
-        corners = [list(map(float, one.attrib.values())) for one in part.iter(f"{space}vertex")]
-        faces = [list(map(int, one.attrib.values())) for one in part.iter(f"{space}triangle")]
+        corners = [list(map(float, node.attrib.values())) for node in part.iter(f"{space}vertex")]
+        faces = [list(map(int, node.attrib.values())) for node in part.iter(f"{space}triangle")]
         counts.append(trimesh.Trimesh(corners, faces, process=False).volume)
     assert counts == pytest.approx([solid.volume, inlay.volume], rel=1e-3)
 
 
 def test_the_files_of_a_gauge(tmp_path: Path, capsys):
     assert gauge.main(["--cut", "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert "recessed by 0.6 mm" in said
-    assert "gauge.3mf" not in said
+    printed = capsys.readouterr().out
+    assert "recessed by 0.6 mm" in printed
+    assert "gauge.3mf" not in printed
+    body = trimesh.load(tmp_path / "gauge.stl")
+    width_mm, height_mm, tallest_mm = np.ptp(body.bounds, axis=0)
+    assert f"gauge: {width_mm:g} x {height_mm:g} mm, {tallest_mm:.1f} mm tall: " in printed
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["calliper.csv", "gauge.json", "gauge.stl", "gauge.svg"]
     truth = read_solid_gauge(tmp_path / "gauge.json")

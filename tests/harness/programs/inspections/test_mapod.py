@@ -13,10 +13,12 @@ import pytest
 from scipy import special
 
 from harness.evaluation.pod.curve import PodCurve, link_ppf
+from harness.evaluation.pod.inspections import Inspections
+from harness.evaluation.study.limit import limit_of
 from harness.evaluation.study.record import record_text
 from harness.programs.inspections import pod
 from harness.programs.inspections.design_statistics import curve_through, even_sizes
-from harness.programs.inspections.mapod import LIMIT_AT, Transfer, quantile
+from harness.programs.inspections.mapod import LIMIT_AT, Mapod, Transfer, quantile
 from tests.support.synthetic_study import SetUp, Study, study_record
 from tests.validation.mapod_coverage import coverage, wrong_by
 
@@ -175,8 +177,32 @@ def test_agreement_counts_simulated_campaigns_that_are_as_far() -> None:
     be: 1 of 1000. Hits as expected are no evidence."""
     curve = uncertain(False)
     size = np.array([1.0, 2.0, 3.0, 8.0, 9.0, 10.0])
-    assert campaign(size, size < 5.0, curve).agreement() < 0.01
+    assert campaign(size, size < 5.0, curve).agreement() == 1 / 1000
     assert campaign(size, size > 5.0, curve).agreement() > 0.2
+
+
+def test_the_combined_limit_is_the_largest_over_all_simulated_models() -> None:
+    record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
+    statement = limit_of(record.set_ups[0], draws=10).statement
+    assert statement is not None
+    size = even_sizes(24, (2.0, 12.0))
+    hit = np.random.default_rng(2).random(24) < curve_through(6.0, 7.6).pod(size)
+    read = Inspections(
+        path=Path("real.csv"),
+        size_column="size",
+        response_column="found",
+        size=size,
+        response=hit.astype(float),
+        target=None,
+        line=np.arange(1, 25),
+    )
+    # the likeliest model has the largest limit here: it is put last
+    reversed_fits = replace(statement, fits=statement.fits[::-1])
+    combined = Mapod.of("50 frames", reversed_fits, "", read)
+    limits = [transfer.steps()[-1].a90_95 for transfer in combined.transfers]
+    assert max(limits) > limits[0]
+    assert combined.steps[-1].a90_95 == max(limits)
+    assert combined.steps[-1].a90 == combined.transfers[0].steps()[-1].a90
 
 
 @pytest.mark.slow  # a Monte Carlo campaign
@@ -221,65 +247,113 @@ def test_the_limit_covers_the_truth_whatever_the_camera(curve: PodCurve):
     assert np.median([row.median / row.measured for row in rows]) < 1.0
 
 
-def test_the_program_corrects_a_study(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
-):
+TRUTH = curve_through(6.0, 7.6)
+"""The real curve of what the study found at 5 mm half of the time."""
+OPTIONS = ("--size", "size", "--hit", "found", "--unit", "mm")
+
+
+@pytest.fixture
+def study_folder(tmp_path: Path) -> Path:
+    """A study, whose hits plane 1 counted at a threshold of 5, within 15 mm."""
     record = study_record(Study((SetUp(a50_mm=5.0, width_mm=0.8),), boards=30))
     (tmp_path / "study.json").write_text(record_text(record))
-    truth = curve_through(6.0, 7.6)
-    size = even_sizes(24, (2.0, 12.0))
-    hit = np.random.default_rng(2).random(24) < truth.pod(size)
-    rows = [
-        f"{a:.3f},{'hit' if h else 'miss'},{'AB'[n % 2]}"
-        for n, (a, h) in enumerate(zip(size, hit, strict=True))
-    ]
-    table = tmp_path / "real.csv"
-    table.write_text("\n".join(["size,found,board", *rows]) + "\n")
-    arguments = [str(table), "--size", "size", "--hit", "found", "--unit", "mm"]
-    prior = ["--prior", str(tmp_path), "--board", "board", "--out", str(tmp_path / "out")]
-    assert pod.main([*arguments, *prior]) == 0
-    mapod = json.loads((tmp_path / "out" / "mapod.json").read_text())
+    return tmp_path
+
+
+def write_real(folder: Path, counted: dict[str, str] | None = None) -> Path:
+    """Real hits and misses of two boards, with further columns that say how they were counted."""
+    size_mm = even_sizes(24, (2.0, 12.0))
+    hit = np.random.default_rng(2).random(24) < TRUTH.pod(size_mm)
+    further = counted or {}
+    lines = [",".join(["size", "found", "board", *further])]
+    for number in range(24):
+        word = "hit" if hit[number] else "miss"
+        board = "AB"[number % 2]
+        lines.append(",".join([f"{size_mm[number]:.3f}", word, board, *further.values()]))
+    table = folder / "real.csv"
+    table.write_text("\n".join(lines) + "\n")
+    return table
+
+
+def corrected(folder: Path, table: Path, *options: str) -> int:
+    prior = ["--prior", str(folder), "--board", "board", "--out", str(folder / "out")]
+    return pod.main([str(table), *OPTIONS, *prior, *options])
+
+
+def test_the_program_corrects_a_study(
+    study_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert corrected(study_folder, write_real(study_folder)) == 0
     printed = capsys.readouterr().out
+    # the table has no columns on how its hits were counted
     assert printed.startswith("warning:")
     assert "real.csv does not state" in printed.splitlines()[0]
-    assert "simulated" in printed
-    assert "measured" in printed
-    assert "combined" in printed
+    for word in ("simulated", "measured", "combined"):
+        assert word in printed
+    mapod = json.loads((study_folder / "out" / "mapod.json").read_text())
     assert [step["board"] for step in mapod["after_each_board"]] == ["none", "A", "B"]
     assert [step["targets"] for step in mapod["after_each_board"]] == [0, 12, 24]
-    assert mapod["a90_95"] > truth.size_at(0.9) > mapod["simulated"]["a90"]
-    assert (tmp_path / "out" / "mapod.html").read_text().count("<svg") == 1
+    assert mapod["a90_95"] > TRUTH.size_at(0.9) > mapod["simulated"]["a90"]
+    assert (study_folder / "out" / "mapod.html").read_text().count("<svg") == 1
 
-    request.getfixturevalue("unsaved")
-    for counted, word in (
-        ("plane 1,5,15", ""),
+
+@pytest.mark.parametrize(
+    ("detector", "threshold", "radius", "words"),
+    [
+        ("plane 1", "5", "15", ""),
         (
-            "plane 1,5.4,15",
+            "plane 1",
+            "5.4",
+            "15",
             "by plane 1 at a threshold of 5.4, within 15 mm; those of the study by plane 1 at",
         ),
         (
-            "matched 7,5,12",
+            "matched 7",
+            "5",
+            "12",
             "by matched 7 at a threshold of 5, within 12 mm; those of the study by plane 1",
         ),
+    ],
+)
+def test_hits_that_were_counted_otherwise_are_warned_of(
+    study_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    unsaved: None,
+    detector: str,
+    threshold: str,
+    radius: str,
+    words: str,
+) -> None:
+    counted = {"detector": detector, "threshold": threshold, "hit_radius_mm": radius}
+    assert corrected(study_folder, write_real(study_folder, counted)) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("warning:") == bool(words)
+    mapod = json.loads((study_folder / "out" / "mapod.json").read_text())
+    assert bool(mapod["counted_otherwise"]) == bool(words)
+    for text in (
+        first,
+        mapod["counted_otherwise"],
+        (study_folder / "out" / "mapod.html").read_text(),
     ):
-        head = "size,found,board,detector,threshold,hit_radius_mm"
-        table.write_text("\n".join([head, *(f"{row},{counted}" for row in rows)]) + "\n")
-        assert pod.main([*arguments, *prior]) == 0
-        first = capsys.readouterr().out.splitlines()[0]
-        assert first.startswith("warning:") == bool(word)
-        assert word in first
-        assert (
-            word in json.loads((tmp_path / "out" / "mapod.json").read_text())["counted_otherwise"]
-        )
-        assert word in (tmp_path / "out" / "mapod.html").read_text()
+        assert words in text
 
-    for wrong, word in (
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
         (["--board", "board"], "--prior"),
-        (["--prior", str(tmp_path), "--link", "logit"], "--link"),
-        (["--prior", str(tmp_path), "--board", "bord"], "board"),
-        (["--prior", str(tmp_path), "--target", "board"], "one size"),
-        (["--prior", str(tmp_path / "no")], "no"),
-    ):
-        assert pod.main([*arguments, *wrong, "--out", str(tmp_path / "none")]) == 2
-        assert word in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
+        (["--prior", "STUDY", "--link", "logit"], "--link"),
+        (["--prior", "STUDY", "--board", "bord"], "board"),
+        (["--prior", "STUDY", "--target", "board"], "one size"),
+        (["--prior", "STUDY/no"], "no"),
+    ],
+)
+def test_mistakes_about_a_prior_are_told_and_write_nothing(
+    study_folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], word: str
+) -> None:
+    named = [option.replace("STUDY", str(study_folder)) for option in options]
+    out = study_folder / "none"
+    table = write_real(study_folder)
+    assert pod.main([str(table), *OPTIONS, *named, "--out", str(out)]) == 2
+    assert word in capsys.readouterr().err
+    assert not out.exists()

@@ -49,7 +49,7 @@ def frame(
 
 def watched(frames: Iterator[Frame]) -> list:
     watch = Watch(Stream("plate", LENS, 1e-4, iter(())))
-    seconds = [watch.add(each, each.time_s or 0.0) for each in frames]
+    seconds = [watch.add(frame, frame.time_s or 0.0) for frame in frames]
     return [second for second in [*seconds, watch.ended()] if second is not None]
 
 
@@ -133,8 +133,8 @@ def test_the_drift_of_frames_is_that_of_the_target():
 
 def test_a_drift_below_the_step_of_stored_distances_is_seen():
     drawn = (frame(i, noise_m=0.7 * MM, farther_m=0.004 * MM * i) for i in range(100))
-    whole = (replace(each, z_m=np.round(each.z_m, 3)) for each in drawn)
-    seconds = watched(whole)
+    in_millimetres = (replace(frame, z_m=np.round(frame.z_m, 3)) for frame in drawn)
+    seconds = watched(in_millimetres)
     assert seconds[-1].drift.change_m == pytest.approx(0.36 * MM, abs=0.01 * MM)
     assert seconds[-1].drift.per_s == pytest.approx(0.04 * MM, rel=0.05)
 

@@ -214,6 +214,28 @@ def test_every_part_and_damage_is_an_experiment(kind: str, part: str, home: Path
     assert len(proposed("\n".join(f"  {words}" for words, _ in (detect, second, sweep)))) == 3
 
 
+@pytest.mark.parametrize(
+    ("tolerance_mm", "per_board"), [(20.0, 8), (30.0, 4), (40.0, 2), (60.0, 1)]
+)
+def test_as_much_damage_as_leaves_room_is_on_a_board(
+    tolerance_mm: float, per_board: int, home: Path
+) -> None:
+    """Holes of up to twice the tolerance, 10 mm apart: their circles fill at most three tenths of a
+    board of 304.8 x 203.2 mm, and there are at most eight."""
+    inquiry = Inquiry(
+        camera="kinect_v2",
+        recording=None,
+        part="board",
+        kind="through",
+        tolerance_mm=tolerance_mm,
+        depth_mm=None,
+        distance_m=0.8,
+    )
+    file = home / "x.yaml"
+    file.write_text(experiment_text(inquiry, "x"))
+    assert load_experiment(file).config.simulated.target.damage.per_board == per_board
+
+
 def test_questions_name_damage_that_is_known() -> None:
     from harness.programs.implant.implant import DAMAGES
 

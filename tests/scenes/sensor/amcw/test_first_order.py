@@ -169,12 +169,12 @@ def frames_before(unit: SimulatedUnit) -> tuple[Frames, Frames]:
     model = unit.first_order
     assert model is not None
     rng = random_stream(1)
-    whole = []
+    by_chain = []
     drawn = []
     for _ in range(FRAMES):
-        whole.append(unit.model.frame(unit.exposure, rng))
+        by_chain.append(unit.model.frame(unit.exposure, rng))
         drawn.append(model.frame(rng, 0.0))
-    return stacked(unit, whole), stacked(unit, drawn)
+    return stacked(unit, by_chain), stacked(unit, drawn)
 
 
 def stacked(unit: SimulatedUnit, frames: list[DecodedFrame]) -> Frames:
@@ -324,20 +324,20 @@ def test_so_have_those_of_a_dim_and_distant_face(name: str):
     assert_alike(unit, *frames_before(unit))
 
 
-def assert_alike(unit: SimulatedUnit, whole: Frames, drawn: Frames) -> None:
+def assert_alike(unit: SimulatedUnit, by_chain: Frames, drawn: Frames) -> None:
     """By every statistic of every group of pixels."""
-    both = Frames._make(np.concatenate(pair) for pair in zip(whole, drawn, strict=True))
-    assert not np.array_equal(whole.z_m, drawn.z_m, equal_nan=True)
+    all_frames = Frames._make(np.concatenate(pair) for pair in zip(by_chain, drawn, strict=True))
+    assert not np.array_equal(by_chain.z_m, drawn.z_m, equal_nan=True)
     assert np.array_equal(np.isfinite(drawn.z_m), drawn.reason == Reason.VALID)
     for group, pixels in groups_of(unit).items():
         statistics = []
-        for frames in (whole, drawn):
+        for frames in (by_chain, drawn):
             values = {}
-            for reason in np.unique(both.reason):
+            for reason in np.unique(all_frames.reason):
                 values[f"reason {reason}"] = (frames.reason[:, pixels] == reason).mean(axis=1)
             for quantity in ("z_m", "amplitude"):
                 of_quantity = statistics_of(
-                    getattr(frames, quantity).astype(float), pixels, getattr(both, quantity)
+                    getattr(frames, quantity).astype(float), pixels, getattr(all_frames, quantity)
                 )
                 values |= {f"{quantity} {key}": value for key, value in of_quantity.items()}
             statistics.append(values)
@@ -357,26 +357,28 @@ def assert_alike(unit: SimulatedUnit, whole: Frames, drawn: Frames) -> None:
         assert not wrong, (group, wrong)
 
 
-def differences(whole: np.ndarray, drawn: np.ndarray, least_error: float) -> np.ndarray:
+def differences(by_chain: np.ndarray, drawn: np.ndarray, least_error: float) -> np.ndarray:
     """(n,): difference of the means over frames (k, n), in standard errors."""
-    variance = whole.var(axis=0, ddof=1) + drawn.var(axis=0, ddof=1)
+    variance = by_chain.var(axis=0, ddof=1) + drawn.var(axis=0, ddof=1)
     error = np.maximum(np.sqrt(variance / FRAMES), least_error)
-    return (whole.mean(axis=0) - drawn.mean(axis=0)) / error
+    return (by_chain.mean(axis=0) - drawn.mean(axis=0)) / error
 
 
 @pytest.mark.parametrize("name", FILTERING)
 def test_single_pixels_agree_in_mean_and_in_how_often_they_have_a_range(name: str):
     """At a hole before 200 mm: the largest difference of thousands."""
-    whole, drawn = frames_of(name, 200.0)
-    valid_in_whole = np.isfinite(whole.z_m).astype(float)
+    by_chain, drawn = frames_of(name, 200.0)
+    valid_in_whole = np.isfinite(by_chain.z_m).astype(float)
     valid = np.isfinite(drawn.z_m).astype(float)
     mixed = np.minimum(valid_in_whole.var(axis=0), valid.var(axis=0)) > 0.02
     assert mixed.sum() > 30
     assert np.abs(differences(valid_in_whole[:, mixed], valid[:, mixed], 0.0)).max() < SURE
-    always = np.isfinite(whole.z_m).all(axis=0) & np.isfinite(drawn.z_m).all(axis=0)
-    off = differences(whole.z_m[:, always], drawn.z_m[:, always], 1e-7)
+    always = np.isfinite(by_chain.z_m).all(axis=0) & np.isfinite(drawn.z_m).all(axis=0)
+    off = differences(by_chain.z_m[:, always], drawn.z_m[:, always], 1e-7)
     assert np.abs(off).max() < SURE
-    off = differences(whole.amplitude.reshape(FRAMES, -1), drawn.amplitude.reshape(FRAMES, -1), 0.0)
+    off = differences(
+        by_chain.amplitude.reshape(FRAMES, -1), drawn.amplitude.reshape(FRAMES, -1), 0.0
+    )
     assert np.abs(off).max() < SURE
 
 
@@ -384,8 +386,8 @@ def test_the_listed_pixels_are_those_that_frames_lose():
     """Every pixel that some frame loses and another does not is on the list; few others, and no
     even face."""
     unit = unit_before_hole("azure_kinect_nfov", 200.0)
-    whole, _ = frames_of("azure_kinect_nfov", 200.0)
-    valid = np.isfinite(whole.z_m).mean(axis=0)
+    by_chain, _ = frames_of("azure_kinect_nfov", 200.0)
+    valid = np.isfinite(by_chain.z_m).mean(axis=0)
     model = unit.first_order
     assert model is not None
     listed = np.zeros(model.shape, bool)
@@ -417,9 +419,9 @@ def test_a_displaced_frame_is_farther_by_its_displacement():
     face = groups_of(unit)["face"]
     still = model.frame(random_stream(5), 0.0).z_m[unit.cut]
     displaced = model.frame(random_stream(5), 0.006).z_m[unit.cut]
-    whole = unit.model.frame(unit.exposure, random_stream(5)).z_m[unit.cut]
+    by_chain = unit.model.frame(unit.exposure, random_stream(5)).z_m[unit.cut]
     displaced_whole = unit.model.frame(unit.exposure, random_stream(5), 0.006).z_m[unit.cut]
-    expected_m = np.nanmean((displaced_whole - whole)[face])
+    expected_m = np.nanmean((displaced_whole - by_chain)[face])
     assert np.nanmean((displaced - still)[face]) == pytest.approx(expected_m, abs=3e-5)
     listed = np.zeros(model.shape, bool)
     listed.ravel()[model.listed.pixels] = True
@@ -441,13 +443,13 @@ def trial(
     unit: SimulatedUnit,
     number: int,
     hole: np.ndarray,
-    whole: bool,
+    by_chain: bool,
     detector: ThesisDetector,
 ):
     """The highest scores in the hole and anywhere else, in the mean of eight frames."""
-    capture = unit.capture(8, 11, number, int(whole))
+    capture = unit.capture(8, 11, number, int(by_chain))
     with pytest.MonkeyPatch.context() as patch:
-        if whole:
+        if by_chain:
             patch.setitem(unit.__dict__, "first_order", None)
         cloud = average(capture, AverageConfig())
     score = detector.analyse(cloud).score
@@ -488,7 +490,7 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
     hole = ndimage.binary_dilation(floor, np.ones((7, 7)))
     detector = ThesisDetector(ThesisConfig(crop=NoCrop()))
     trials = range(200)
-    whole = np.array(
+    by_chain = np.array(
         [
             trial(
                 unit,
@@ -514,10 +516,10 @@ def test_a_detector_finds_as_often_and_calls_as_often_falsely():
         ],
         float,
     )
-    assert stats.ks_2samp(whole[:, 1], drawn[:, 1]).pvalue > 1e-4
+    assert stats.ks_2samp(by_chain[:, 1], drawn[:, 1]).pvalue > 1e-4
     for column, share in ((0, 0.5), (1, 0.8)):
-        limit = np.quantile(whole[:, column], share)
-        assert abs(compared(whole[:, column] > limit, drawn[:, column] > limit)) < 4
+        limit = np.quantile(by_chain[:, column], share)
+        assert abs(compared(by_chain[:, column] > limit, drawn[:, column] > limit)) < 4
 
 
 @pytest.mark.parametrize("name", FILTERING)
@@ -530,7 +532,7 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     assert isinstance(imager, AmcwImager)
     listed = model.listed
     reading = imager.reading(unit.exposure, random_stream(1))
-    whole = imager.frame(unit.exposure, random_stream(1), 0.002)
+    by_chain = imager.frame(unit.exposure, random_stream(1), 0.002)
     # the last one stands for what is beyond the picture
     of_list = NoisyLight(
         unit=np.pad(reading.unit[..., listed.halo], ((0, 0), (0, 0), (0, 1))),
@@ -543,7 +545,7 @@ def test_listed_pixels_go_through_the_same_chain_as_frames(name: str):
     assert len(listed.pixels) > 100
     # windows of runs in rows, and turned ones of runs in columns
     assert listed.columns.min() < listed.turned <= listed.columns.max()
-    for values, of_picture in zip(part, whole, strict=True):
+    for values, of_picture in zip(part, by_chain, strict=True):
         wanted = of_picture.ravel()[listed.pixels]
         assert np.array_equal(values, wanted, equal_nan=True)
 
@@ -640,10 +642,10 @@ def test_pixels_that_may_saturate_are_listed():
     unit = SimulatedUnit(camera, config, view)
     model = unit.first_order
     assert model is not None
-    whole, drawn = frames_before(unit)
-    saturated = (whole.reason == Reason.SATURATED).mean(axis=0)
+    by_chain, drawn = frames_before(unit)
+    saturated = (by_chain.reason == Reason.SATURATED).mean(axis=0)
     assert ((saturated > 0.01) & (saturated < 0.99)).sum() > 20
-    assert_alike(unit, whole, drawn)
+    assert_alike(unit, by_chain, drawn)
 
 
 def test_pixels_whose_noise_hides_no_steps_of_the_converter_are_listed():

@@ -101,6 +101,11 @@ def test_noise_by_range_and_brightness(distance_m, albedo, sigma_mm):
     assert ideal.amplitude[middle] == pytest.approx(amplitude, rel=1e-3)
 
 
+def test_beyond_the_table_noise_grows_with_the_stated_power_of_range():
+    imager, view = imager_before(3.0, 0.5, noise__range_exponent=1.0)
+    assert imager.expose(view).sigma_m[30, 40] == pytest.approx(4e-3 * 1.5, rel=2e-3)
+
+
 @pytest.mark.parametrize(
     ("albedo", "share"),
     [
@@ -189,6 +194,15 @@ def test_returns_are_lost_across_a_step(gap_px, step_m, chances):
     view = stepped_view(camera, step_m)
     ideal = EmpiricalImager(camera, QUIET, REGION, view.slopes).expose(view)
     assert ideal.chance[30, 36:43] == pytest.approx(chances, abs=1e-6)
+
+
+def test_a_return_is_lost_by_darkness_or_at_a_step_independently():
+    """A share of 0.4 is lost by darkness; of the rest, half at the gap's ends."""
+    camera = camera_with(edge__gap_px=3.0, dropouts__share=[0.4, 0.4])
+    view = stepped_view(camera, 0.1)
+    ideal = EmpiricalImager(camera, NOISY, REGION, view.slopes).expose(view)
+    expected = [0.4, 0.4, 1 - 0.6 * 0.5, 1.0, 1.0, 1 - 0.6 * 0.5, 0.4]
+    assert ideal.chance[30, 36:43] == pytest.approx(expected, abs=1e-6)
 
 
 def test_smoothed_depth_keeps_planes_and_softens_steps():

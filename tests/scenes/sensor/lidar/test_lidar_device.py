@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.vocabulary.errors import UserError
-from harness.vocabulary.geometry import Reason, Region
+from harness.vocabulary.geometry import SPEED_OF_LIGHT_AIR, Reason, Region
 from scenes.closed_form import Plane, layered_view, plane_view
 from scenes.optics import NoiseFreeView
 from scenes.sensor.calibration import ONLY_NOISE
@@ -223,6 +223,56 @@ def test_effects_that_are_off_are_absent():
         # nothing to saturate, no other path, no noise to add to, no harmonics
         silent = name in ("multipath", "wiggling", "ambient", "saturation")
         assert np.array_equal(with_effect[0], z[0]) == silent, name
+
+
+@pytest.mark.parametrize(
+    ("effects", "is_saturated"),
+    [
+        ({"saturation": True, "ambient": True}, True),
+        ({"saturation": True}, False),
+        ({"ambient": True}, False),
+    ],
+)
+def test_a_beam_is_saturated_by_its_light_and_the_ambient_together(
+    effects: dict[str, bool], is_saturated: bool
+) -> None:
+    """The limit lies above the light that returns, by half of the ambient light."""
+    config = CameraConfig(
+        name=CAMERA.name,
+        effects=NO_EFFECTS.model_copy(update=effects),
+        ambient_uw_cm2_nm=1.0,
+    )
+    view = plane_view(CAMERA, PATCH, 1.0, 0.6)
+    unit = SimulatedUnit(CAMERA, config, view)
+    signal = (unit.model.gathered * view.intensity).max()
+    ambient = CAMERA.ambient_electrons(1.0)
+    limited = changed({"photons.full_scale_electrons": float(signal + 0.5 * ambient)})
+    frame = first_frame(SimulatedUnit(limited, config, view))
+    assert (frame.reason == Reason.SATURATED).all() == is_saturated
+    assert (frame.reason == Reason.SATURATED).any() == is_saturated
+
+
+def test_the_way_back_to_the_receiver_beside_the_transmitter_is_in_the_range():
+    """At 0.3 m the way back is longer by 0.7 mm to a receiver 20 mm aside."""
+    assert np.linalg.norm(CAMERA.optics.emitter_m) == pytest.approx(0.02)
+    camera = changed(FINE)
+    z_m = z_of(SimulatedUnit(camera, QUIET, plane_view(camera, PATCH, 0.3, 0.6)))
+    assert np.abs(z_m - 0.3).max() < 2e-5
+
+
+def test_a_peak_of_noise_is_as_uncertain_as_a_delay_in_white_noise():
+    """Cramer and Rao's bound: half of what light travels in 1 / bandwidth, over the peak's height
+    in deviations of the noise."""
+    camera = changed(RAW)
+    dark = plane_view(camera, PATCH, 1.0, 0.0)
+    unit = SimulatedUnit(camera, ONLY_NOISE.model_copy(update={"name": camera.name}), dark)
+    scanner = unit.model
+    _, height, deviation_m = scanner._noisy_peaks(unit.exposure, np.random.default_rng(1))
+    level = height / (scanner.averaged * unit.exposure.noise)
+    is_high = level > 1.0
+    assert is_high.mean() > 0.5
+    bound_m = SPEED_OF_LIGHT_AIR / 2 / camera.bandwidth_rad_s
+    assert (deviation_m * level)[is_high] == pytest.approx(bound_m, rel=1e-4)
 
 
 def test_ripples_have_the_size_and_length_of_their_facts():
