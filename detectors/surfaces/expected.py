@@ -184,6 +184,10 @@ def fitted(
     share_px: float = 1.0,
 ) -> Pose:
     """Move points (n, 3) from ``T_start`` (part's frame from the points') onto the triangles.
+
+    A point counts within a few of the points' spacings at least: the sparser they are, the farther
+    from its start a part is found, and the less precisely.
+
     ``known``: a pose that counts by its covariance, at which the search starts by planes;
     ``share_px``: number of points that share their noise."""
     T = T_start
