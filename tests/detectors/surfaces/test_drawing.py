@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from detectors import load_detector
 from detectors.surfaces import drawing as drawing_module
-from detectors.surfaces.drawing import DrawingFile, drawing_under, read_drawing
+from detectors.surfaces.drawing import DrawingFile, drawing_of, drawing_under, read_drawing
+from detectors.surfaces.expected import closest_of, fitted
 from harness.detect import main
 from harness.inspection.arguments import detector_of, drawing_file_of
 from harness.vocabulary.errors import UserError
@@ -156,6 +157,25 @@ def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> Non
     assert np.linalg.norm(centre[:2] - (0, 15)) < 3.0
     # ribs pass for damage where nothing is known of the part
     assert len(damage_mm({"shape": "auto"})) > 1
+
+
+@pytest.mark.parametrize(
+    ("beside", "nearest_mm"), [(0.2, 0.5), (0.3, (0.7 * 0.5 + 0.1 * 60) / 0.8)]
+)
+def test_starts_are_judged_on_the_nearest_points(beside: float, nearest_mm: float) -> None:
+    """Of points 0.5 mm above and below a square, a share lies 60 mm beside it."""
+    square_mm = np.array([(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)], float)
+    triangles = drawing_of("square", MM * square_mm[[[0, 1, 2], [0, 2, 3]]]).triangles
+    column, row = np.meshgrid(np.arange(20), np.arange(20))
+    up_mm = np.where((column + row) % 2, 0.5, -0.5)
+    points_mm = np.stack([5 * column - 47.5, 5 * row - 47.5, up_mm], axis=-1).reshape(-1, 3)
+    count = round(beside * 400)
+    points_mm[:count, 0] = np.where(np.arange(count) % 2, 110.0, -110.0)
+    points_mm[:count, 2] = 0.0
+    pose = fitted(triangles, MM * points_mm, np.eye(4))
+    worse = replace(pose, nearest_m=1.01 * pose.nearest_m, off_m=0.0, apart_m=0.0)
+    assert pose.nearest_m == pytest.approx(nearest_mm * MM, rel=0.01)
+    assert closest_of([worse, pose]) is pose
 
 
 def test_mistakes_are_told(tmp_path: Path) -> None:
