@@ -110,12 +110,12 @@ def drawing_under(drawing: Drawing, points: np.ndarray, central: bool) -> Expect
 
 
 def _placed(front: Triangles, sample: np.ndarray) -> Pose:
-    """Return the pose of points (n, 3) on the front: from the start that fits some of them best."""
+    """Return the pose of points (n, 3) on the front. Some of them choose among the poses that they
+    reach from all starts; all go on from that pose, since they reach less far (`fitted`)."""
     thinned = few_of(sample, FEW)
-    starts = [_start(front, sample, turn) for turn in range(ROLLS)]
-    poses = [fitted(front, thinned, start) for start in starts]
-    best = poses.index(closest_of(poses))
-    return fitted(front, sample, starts[best])
+    poses = [fitted(front, thinned, _start(front, sample, turn)) for turn in range(ROLLS)]
+    best = closest_of(poses)
+    return fitted(front, sample, best.T_part_camera)
 
 
 def _start(front: Triangles, points: np.ndarray, turn: int) -> np.ndarray:

@@ -12,6 +12,7 @@ the captures, and an error of range that a whole capture shares, which the place
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -71,7 +72,8 @@ BEYOND_NOISE = 3.0
 APART_M = 2.0 * MM
 """... and by more than this, which is where registered views count as different targets, too."""
 MOST = 0.8
-"""Share of the part, nearest first, on which this is judged: damage may cover the rest."""
+"""Share of the part, nearest first, on which this and starts are judged: damage may cover the
+rest."""
 # a direction with a smaller share of the largest information is not fixed by the part
 LOOSE = 1e-6
 
@@ -120,6 +122,8 @@ class Pose:
     """Median distance of the points from the triangles' planes."""
     apart_m: float
     """Mean distance of the points from the triangles, beyond their edges too."""
+    nearest_m: float
+    """The same of those `MOST` of the points that are nearest."""
     error_m: float
     """Root mean square standard error along the planes of where the triangles lie, if the points
     are independent."""
@@ -184,6 +188,10 @@ def fitted(
     share_px: float = 1.0,
 ) -> Pose:
     """Move points (n, 3) from ``T_start`` (part's frame from the points') onto the triangles.
+
+    A point counts within a few of the points' spacings at least: the sparser they are, the farther
+    from its start a part is found, and the less precisely.
+
     ``known``: a pose that counts by its covariance, at which the search starts by planes;
     ``share_px``: number of points that share their noise."""
     T = T_start
@@ -232,10 +240,12 @@ def fitted(
     )
     inverse = np.linalg.pinv(weighted @ slopes, rcond=LOOSE, hermitian=True)
     variances = np.einsum("ni,ij,nj->n", slopes, inverse, slopes)
+    distances_m = np.sort(np.linalg.norm(offsets, axis=1))
     return Pose(
         T_part_camera=T,
         off_m=float(np.median(np.abs(off))),
-        apart_m=float(np.linalg.norm(offsets, axis=1).mean()),
+        apart_m=float(distances_m.mean()),
+        nearest_m=float(distances_m[: math.ceil(MOST * len(distances_m))].mean()),
         error_m=float(np.sqrt(spread_m2 * variances.mean())),
         covariance=covariance,
         middle_m=middle,
@@ -467,5 +477,6 @@ def another_part(points_m: np.ndarray, off_m: np.ndarray, variances_m2: np.ndarr
 
 
 def closest_of(poses: Sequence[Pose]) -> Pose:
-    """Return the pose with the least median distance from the triangles' planes."""
-    return min(poses, key=lambda pose: pose.off_m)
+    """Return the pose whose nearest points lie closest to the triangles. What lies beside the part
+    does not count, and what lies beyond an edge does, as it does not for distances from planes."""
+    return min(poses, key=lambda pose: pose.nearest_m)

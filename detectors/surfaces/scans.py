@@ -208,21 +208,22 @@ def placed(
     if known is not None:
         best = fitted(scan.coarse, sample, known.T_part_camera, known, share_px=shared)
     else:
-        start = _best_start(scan, points_m, few_of(sample, FEW))
-        best = fitted(scan.coarse, sample, start, share_px=shared)
+        coarse = _coarse_pose(scan, points_m, few_of(sample, FEW))
+        best = fitted(scan.coarse, sample, coarse.T_part_camera, share_px=shared)
     return refined(scan.triangles, best, sample, central=central, known=known, share_px=shared)
 
 
-def _best_start(scan: PartScan, points_m: np.ndarray, few_m: np.ndarray) -> np.ndarray:
-    """Return the start (4, 4) from which some of a part's points (n, 3) come closest to a scan. All
-    are tried: the outline of a part that lies upside down may fit to a pixel."""
+def _coarse_pose(scan: PartScan, points_m: np.ndarray, few_m: np.ndarray) -> Pose:
+    """Return the pose at which some of a part's points (n, 3) come closest to a scan. All starts
+    are tried: the outline of a part that lies upside down may fit to a pixel. All points go on from
+    this pose, not from its start, since they reach less far (`fitted`)."""
     starts = _starts(scan.points_m, points_m)
-    apart_m = [fitted(scan.coarse, few_m, start).apart_m for start in starts]
-    best = 0
-    for number in range(1, len(starts)):
-        if apart_m[number] < BETTER * apart_m[best]:
-            best = number
-    return starts[best]
+    poses = [fitted(scan.coarse, few_m, start) for start in starts]
+    best = poses[0]
+    for pose in poses[1:]:
+        if pose.apart_m < BETTER * best.apart_m:
+            best = pose
+    return best
 
 
 def _starts(scan_m: np.ndarray, part_m: np.ndarray) -> list[np.ndarray]:

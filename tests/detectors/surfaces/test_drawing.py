@@ -12,7 +12,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from detectors import load_detector
-from detectors.surfaces.drawing import DrawingFile, drawing_under, read_drawing
+from detectors.surfaces import drawing as drawing_module
+from detectors.surfaces.drawing import DrawingFile, drawing_of, drawing_under, read_drawing
+from detectors.surfaces.expected import closest_of, fitted
 from harness.detect import main
 from harness.inspection.arguments import detector_of, drawing_file_of
 from harness.vocabulary.errors import UserError
@@ -109,6 +111,26 @@ def test_a_part_is_found_where_it_lies(
     assert noise_m == pytest.approx(0.5 * MM, rel=0.15)
 
 
+def test_all_points_go_on_from_the_pose_that_some_find(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a start that is 84 degrees off, 550 points find the part, and 4,400 do not."""
+    start = drawing_module._start
+    monkeypatch.setattr(
+        drawing_module, "_start", lambda front, points, _: start(front, points, turn=2)
+    )
+    path = casting(tmp_path / "casting.stl")
+    drawing = read_drawing(DrawingFile(file=str(path)))
+    T = stood((-5, 3, 6), quarter=1)
+    cloud = seen(path, T, 0.5)
+    points_m = cloud.points_m[cloud.valid]
+    surface = drawing_under(drawing, points_m, central=True)
+    points_part = transform_points(np.linalg.inv(T), points_m)
+    placed_m = transform_points(np.array(surface.facts["T_reference_camera"]), points_m)
+    # less than a pixel, 1.6 mm
+    assert np.linalg.norm(placed_m - points_part, axis=1).max() < 1.0 * MM
+
+
 @pytest.mark.parametrize(
     "detector",
     [
@@ -135,6 +157,25 @@ def test_only_damage_differs_from_the_mesh(tmp_path: Path, detector: str) -> Non
     assert np.linalg.norm(centre[:2] - (0, 15)) < 3.0
     # ribs pass for damage where nothing is known of the part
     assert len(damage_mm({"shape": "auto"})) > 1
+
+
+@pytest.mark.parametrize(
+    ("beside", "nearest_mm"), [(0.2, 0.5), (0.3, (0.7 * 0.5 + 0.1 * 60) / 0.8)]
+)
+def test_starts_are_judged_on_the_nearest_points(beside: float, nearest_mm: float) -> None:
+    """Of points 0.5 mm above and below a square, a share lies 60 mm beside it."""
+    square_mm = np.array([(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)], float)
+    triangles = drawing_of("square", MM * square_mm[[[0, 1, 2], [0, 2, 3]]]).triangles
+    column, row = np.meshgrid(np.arange(20), np.arange(20))
+    up_mm = np.where((column + row) % 2, 0.5, -0.5)
+    points_mm = np.stack([5 * column - 47.5, 5 * row - 47.5, up_mm], axis=-1).reshape(-1, 3)
+    count = round(beside * 400)
+    points_mm[:count, 0] = np.where(np.arange(count) % 2, 110.0, -110.0)
+    points_mm[:count, 2] = 0.0
+    pose = fitted(triangles, MM * points_mm, np.eye(4))
+    worse = replace(pose, nearest_m=1.01 * pose.nearest_m, off_m=0.0, apart_m=0.0)
+    assert pose.nearest_m == pytest.approx(nearest_mm * MM, rel=0.01)
+    assert closest_of([worse, pose]) is pose
 
 
 def test_mistakes_are_told(tmp_path: Path) -> None:

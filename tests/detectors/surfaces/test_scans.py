@@ -41,6 +41,16 @@ def test_a_part_upside_down_is_found() -> None:
     assert laid.facts["median_off_mm"] < 0.15
 
 
+def test_a_part_turned_far_is_found() -> None:
+    """From the chosen start, 150 points find the part, and 4,000 do not."""
+    turned = pose((-6.0, 5.0, 75.0), (4.0, -3.0))
+    cloud, mask = cloud_of(MadePart(), turned, seed=2)
+    points_m = cloud.points_m[mask]
+    placed_m = transform_points(placed(SCAN, points_m, 1.0, True, None).T_part_camera, points_m)
+    true_m = transform_points(pose() @ invert(turned), points_m)
+    assert np.linalg.norm(placed_m - true_m, axis=1).max() < 0.1 * MM
+
+
 def test_what_is_expected_is_what_was_recorded() -> None:
     cloud, mask = cloud_of(MadePart(), TURNED, seed=2)
     laid = laid_under(SCAN, cloud, mask)
