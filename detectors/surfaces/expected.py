@@ -47,8 +47,11 @@ FAR_M = 10.0
 EDGE_PX = 1.5  # pixels within this distance of a step or edge of the part are not judged
 BENT = 0.5
 """Bend, in pixels, that makes an edge."""
-REFINEMENTS = 8
-"""Number of steps along rays."""
+REFINEMENTS = 40
+"""Most steps along rays."""
+STILL = 1e-4
+"""Step along rays, in pixels, after which no further follows. On the mean of several parts, steps
+shrink slowly: eight end 0.1 pixels too early."""
 NOISE_MARGIN = 2.0
 """Multiple of the information that noise feigns which is taken off: rounding and filters make it
 differ from that of independent pixels."""
@@ -383,7 +386,10 @@ def refined(
         )
         information = start.information_about(middle)
         gradient = weighted @ off - information @ start.offset_of(T, middle)
-        T = moved_by(np.linalg.inv(weighted @ slopes + information) @ gradient, middle) @ T
+        motion = np.linalg.inv(weighted @ slopes + information) @ gradient
+        T = moved_by(motion, middle) @ T
+        if np.abs(motion / steps).max() < STILL:
+            break
     covariance = _covariance(
         weighted @ slopes - NOISE_MARGIN * by_noise, information, arm_m=arm_m, loosest_m=pitch_m
     )

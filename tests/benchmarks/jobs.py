@@ -2,11 +2,12 @@
 
 Runs each shipped experiment and the main programs, or the named ones, with two processes. A job
 that stores trials runs three times: from nothing; with its renders stored, but no trials; and with
-everything stored. Each row is printed and stored in ``results/costs/jobs.csv`` as soon as it is
-known. A job that this code has already been measured on is left out (``--again``: measured again),
-so that the same command goes on after it was stopped. All takes some two hours on an idle machine
-with two cores. What renders, trials and all else of each experiment cost from nothing is stored in
-``bills.csv`` beside it, from which ``--dry-run`` says what to expect.
+everything stored. With ``--once`` it runs from nothing only. Each row is printed and stored in
+``results/costs/jobs.csv`` as soon as it is known. A job that this code has already been measured on
+is left out (``--again``: measured again), so that the same command goes on after it was stopped.
+All takes some two hours on an idle machine with two cores. What renders, trials and all else of
+each experiment cost from nothing is stored in ``bills.csv`` beside it, from which ``--dry-run``
+says what to expect.
 
 ``--quick`` runs the first look of each experiment instead, once, from nothing, for ``quick.csv``;
 all takes some fifteen minutes. ``--results results`` keeps what was made in that folder of
@@ -181,6 +182,7 @@ def main() -> None:
     add("--results", type=Path, metavar="DIR", help="folder of results that keeps what is made")
     add("--before", type=Path, metavar="DIR", help="checkout of other code, run in turns")
     add("--again", action="store_true", help="also measure what this code was measured on")
+    add("--once", action="store_true", help="from nothing only, for jobs that take long")
     options = parser.parse_args()
     adopt_orphans()
     jobs = jobs_named(options.names)
@@ -233,8 +235,10 @@ def full_table(jobs: Sequence[Job], options: argparse.Namespace) -> bool:
     make_inputs(folders)
     for job in left_to_measure(jobs, stored_rows(path, Row), again=options.again):
         try:
-            before = None if before_at is None else before_of(job, before_at, folders)
-            now = runs_of(job, ROOT, folders)
+            before = None
+            if before_at is not None:
+                before = before_of(job, before_at, folders, once=options.once)
+            now = runs_of(job, ROOT, folders, once=options.once)
         except Failed as failure:
             print(f"{job.name}: {failure}", file=sys.stderr, flush=True)
             all_well = False
@@ -281,20 +285,21 @@ def make_inputs(folders: Mapping[str, Path]) -> None:
             run(ROOT, [*words, "--out", str(folder)])
 
 
-def before_of(job: Job, checkout: Path, folders: Mapping[str, Path]) -> Runs | None:
+def before_of(job: Job, checkout: Path, folders: Mapping[str, Path], *, once: bool) -> Runs | None:
     """Return the runs of a job by another checkout; None if it has no such experiment, or cannot
     do it."""
     if job.experiment and not (checkout / job.experiment).exists():
         return None
     try:
-        return runs_of(job, checkout, folders)
+        return runs_of(job, checkout, folders, once=once)
     except Failed as failure:
         print(f"{job.name}, before: {failure}", file=sys.stderr, flush=True)
         return None
 
 
-def runs_of(job: Job, checkout: Path, folders: Mapping[str, Path]) -> Runs:
-    """Run a job in an empty folder, because experiments share renders. Raises Failed."""
+def runs_of(job: Job, checkout: Path, folders: Mapping[str, Path], *, once: bool) -> Runs:
+    """Run a job in an empty folder, because experiments share renders; ``once``: from nothing only.
+    Raises Failed."""
     work = folders["out"]
     shutil.rmtree(work, ignore_errors=True)
     words = job.command(folders)
@@ -303,8 +308,8 @@ def runs_of(job: Job, checkout: Path, folders: Mapping[str, Path]) -> Runs:
     bill = past_run(work / job.stored / LATEST) if is_sweep else None
     if job.makes and not any(work.glob(job.makes)):
         raise Failed(f"it made no {job.makes}")
-    if not job.stored:
-        return Runs(from_nothing)
+    if once or not job.stored:
+        return Runs(from_nothing, bill=bill)
     shutil.rmtree(work / job.stored)
     renders_stored = run(checkout, words)
     all_stored = run(checkout, words)

@@ -83,11 +83,15 @@ def test_a_job_without_trials_runs_once(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(jobs, "run", pretended)
     smoke, ask = whole_jobs.jobs_named(["smoke", "ask"])
-    runs = jobs.runs_of(smoke, tmp_path, jobs.folders_in(tmp_path))
+    runs = jobs.runs_of(smoke, tmp_path, jobs.folders_in(tmp_path), once=False)
     assert runs.all_stored is not None
     assert found == [[], [".cache"], [".cache", "smoke"]]
     found.clear()
-    assert jobs.runs_of(ask, tmp_path, jobs.folders_in(tmp_path)).renders_stored is None
+    runs = jobs.runs_of(smoke, tmp_path, jobs.folders_in(tmp_path), once=True)
+    assert runs.renders_stored is None
+    assert found == [[]]
+    found.clear()
+    assert jobs.runs_of(ask, tmp_path, jobs.folders_in(tmp_path), once=False).renders_stored is None
     assert found == [[]]
 
 

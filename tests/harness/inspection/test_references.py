@@ -29,6 +29,7 @@ from harness.inspection.changes import (
     changes_of,
 )
 from harness.inspection.references import captures_in
+from harness.inspection.verdict import MOST_NOISE
 from harness.report.findings import Judged
 from tests.harness.inspection.test_verdict import finding, judged_of
 from tests.support import marked_board
@@ -94,10 +95,10 @@ def test_features_of_good_parts_are_no_findings(
     threshold = data["threshold"]["k"]
     clear = [finding for finding in data["findings"] if finding["score"] > 2 * threshold]
     assert [finding["term"] for finding in clear] == ["dent"] * 3
-    # one false call is expected at this threshold, and none stands far above it
-    others = [finding["score"] for finding in data["findings"] if finding not in clear]
-    assert len(others) <= 1
-    assert all(score < 1.2 * threshold for score in others)
+    # one false call is expected at this threshold, up to five by its interval; none is called sure
+    others = [finding for finding in data["findings"] if finding not in clear]
+    assert len(others) <= 5
+    assert all(finding["noise_probability"] > MOST_NOISE for finding in others)
     assert data["surface"]["reference"]["parts"] == 4
     assert data["change"] is None
     assert "on 4 good parts, each left out once" in capsys.readouterr().out
